@@ -1,0 +1,645 @@
+"""The vehicle agent: one vehicle's whole behaviour, without I/O. The only place where core and wire meet.
+
+The same object flies a drone, a stub in real time, a stub in lockstep, and a recorded flight in replay: bytes and time
+go in, bytes come out. It never reads a clock and never raises for what others send.
+"""
+
+import json
+from collections import Counter
+from dataclasses import dataclass, field
+from math import dist, hypot
+from random import Random
+from typing import Any
+
+from companion.autopilot import AutopilotClient
+from companion.config import FleetConfig
+from companion.core.estimate import BiasObserver, SendFilter
+from companion.core.frames import Ned
+from companion.core.law import NO_SUMS, add, finish, pair, separation
+from companion.core.neighbours import PeerTable, held
+from companion.core.phase import PhaseEvent, next_phase
+from companion.core.plan import (
+    Motion,
+    Programme,
+    Reference,
+    assignment_matches,
+    with_formation,
+    with_legs,
+)
+from companion.core.safety import SafetyFilter
+from companion.core.trigger import exceeds, switching_exceeds
+from companion.core.values import (
+    FILTERED_PHASES,
+    ZERO,
+    Command,
+    Instant,
+    Neighbour,
+    PeerMessage,
+    PeerSample,
+    Phase,
+    SafeSetpoint,
+    VehicleState,
+)
+from companion.errors import ConfigError, WireError
+from companion.wire import mavlink as wire
+from companion.wire.mavlink import MavlinkLink, Px4Mode, mode_name
+from companion.wire.peer import decode_motion, decode_state, encode_motion, encode_state
+
+CONTROL_PERIOD_NS = 20_000_000
+TIMER_SLACK = 1.5
+"""without a new position the control tick comes this many periods after the last"""
+PROPOSAL_DELAY_NS = 3_000_000_000
+"""how far ahead a vehicle proposes a start that follows by itself"""
+SETTLED_TOLERANCE_M = 0.6
+SETTLED_FOR_NS = 1_000_000_000
+ALTITUDE_TOLERANCE_M = 0.4
+CLIMB_LIMIT_NS = 60_000_000_000
+RESEND_NS = (250_000_000, 1_000_000_000)
+"""a change of phase or motion is repeated after these delays, since one message may be lost"""
+CATCH_UP_NS = 1_000_000_000
+FLYING = frozenset({Phase.ARMED, Phase.CLIMBING, Phase.FORMING, Phase.FORMED, Phase.LANDING})
+
+
+@dataclass(slots=True)
+class Tick:
+    """What one control tick did, for the log and the live table."""
+
+    time: Instant
+    driven_by_position: bool
+    position_error_m: float
+    """distance from the own slot"""
+    neighbours: int
+    nearest_m: float
+    acceleration_m_s2: tuple[float, float]
+
+
+@dataclass(slots=True)
+class Outputs:
+    """What to send after one `advance`, in order."""
+
+    mavlink: list[bytes] = field(default_factory=list)
+    peers: list[tuple[str, bytes]] = field(default_factory=list)
+    """(topic, payload)"""
+    notes: list[str] = field(default_factory=list)
+    """what happened, for the log"""
+    tick: Tick | None = None
+
+
+class Agent:
+    """One vehicle of the fleet."""
+
+    def __init__(self, config: FleetConfig, vehicle_id: int, boot_id: int) -> None:
+        self.config = config
+        self.vehicle = config.by_id(vehicle_id)
+        self.id = vehicle_id
+        self.boot_id = boot_id
+        self.phase = Phase.IDLE
+        self.failsafes: list[str] = []
+        self.rejected: Counter[str] = Counter()
+        self.link = MavlinkLink(self.vehicle.system_id)
+        origin = config.origin if config.fleet.frame == "global" else None
+        self.autopilot = AutopilotClient(self.link, origin)
+        self.programme = Programme([config.first_motion])
+        others = frozenset(v.id for v in config.vehicles) - {vehicle_id}
+        self.peers = PeerTable(vehicle_id, others, config.peer_limits, self.programme)
+        self.safety = SafetyFilter(config.safety_limits)
+        self.messages_sent = 0
+        self.setpoints_sent = 0
+        self._gains = config.gains
+        self._error_trigger = config.error_trigger
+        self._switching_trigger = config.switching_trigger
+        self._spacing = config.message_spacing
+        self._random = Random(vehicle_id << 32 | boot_id)
+        self._bias = (BiasObserver(), BiasObserver(), BiasObserver())
+        self._filter = (SendFilter(), SendFilter(), SendFilter())
+        self._take_off_wanted = False
+        self._position_came = False
+        self._last_tick: Instant | None = None
+        self._tick: Tick | None = None
+        self._sequence = 0
+        self._sent: tuple[PeerSample, tuple[Ned, Ned]] | None = None
+        """last sample sent, with p_ref and v_d at its time"""
+        self._sent_ns = 0
+        self._silence_limit_s = 0.0
+        self._resend_ns: list[int] = []
+        self._plan_due_ns: int | None = None
+        self._behind = False
+        self._phase_since_ns = 0
+        self._settled_since_ns: int | None = None
+        self._formation_since_ns: int | None = None
+        self._mode_asked_ns = 0
+        self._land_seen = False
+        self._outputs = Outputs()
+
+    # -- inputs ------------------------------------------------------------------------------------------------------
+
+    def receive_mavlink(self, datagram: bytes, now: Instant) -> None:
+        """Bytes of one datagram from the autopilot's link."""
+        if self.autopilot.receive(datagram, now):
+            self._position_came = True
+
+    def receive_peer(self, key: str, payload: bytes, now: Instant) -> None:
+        """A peer's put: `fleet/<id>/state` or `fleet/<id>/plan`."""
+        topic = key.rsplit("/", 1)[-1]
+        try:
+            if topic == "plan":
+                self._consider(decode_motion(payload), now)
+                return
+            message = decode_state(payload)
+        except WireError as error:
+            self.rejected[f"{topic}: {str(error).split(':')[0]}"] += 1
+            return
+        if key.split("/")[-2:-1] != [str(message.sample.vehicle_id)]:
+            self.rejected["state: id is not the key's"] += 1
+            return
+        if self.peers.accept(message, now) is None:
+            self._compare_motions(message, now)
+
+    def receive_presence(self, vehicle_id: int, alive: bool, now: Instant) -> None:
+        """A peer's process appeared or ended."""
+        self.peers.presence(vehicle_id, alive, now)
+        if alive:
+            # Whoever comes late has our last state from the cache; the plan it may lack is told again.
+            self._plan_due_ns = now.monotonic_ns if self.programme.newest.revision > 0 else None
+
+    def receive_command(self, payload: bytes, now: Instant) -> bytes:
+        """An operator's command as JSON; returns the answer as JSON."""
+        try:
+            command = json.loads(payload)
+            verb = command["verb"]
+        except (ValueError, KeyError, TypeError):
+            self.rejected["command: malformed"] += 1
+            return self._reply("not a command: needs a JSON object with a verb")
+        match verb:
+            case "takeoff":
+                return self._reply(self._command_take_off(now))
+            case "land":
+                return self._reply(self._command_land(now))
+            case "motion":
+                try:
+                    motion = decode_motion(json.dumps(command.get("motion")).encode())
+                except WireError as error:
+                    self.rejected["command: motion"] += 1
+                    return self._reply(str(error))
+                return self._reply(self._consider(motion, now))
+        self.rejected["command: unknown verb"] += 1
+        return self._reply(f"unknown verb {verb!r}; known: takeoff, land, motion")
+
+    def _reply(self, refusal: str | None) -> bytes:
+        answer = {
+            "vehicle": self.id,
+            "accepted": refusal is None,
+            "reason": refusal,
+            "phase": self.phase.name.lower(),
+            "revision": self.programme.newest.revision,
+        }
+        return json.dumps(answer).encode()
+
+    def _command_take_off(self, now: Instant) -> str | None:
+        if self.phase in FLYING or self._take_off_wanted:
+            return None
+        if self.phase is Phase.RELEASED:
+            return "the pilot has the vehicle"
+        reasons = self.unready(now)
+        if reasons:
+            return "; ".join(reasons)
+        self._happened(PhaseEvent.TAKE_OFF, now)
+        self._take_off_wanted = True
+        return None
+
+    def _command_land(self, now: Instant) -> str | None:
+        self._take_off_wanted = False
+        if self.phase is Phase.RELEASED:
+            return "the pilot has the vehicle"
+        self._happened(PhaseEvent.LAND, now)
+        return None
+
+    def stop(self, now: Instant) -> None:
+        """The process is asked to end: land. `stopped` tells when the autopilot has taken over."""
+        self._command_land(now)
+
+    @property
+    def stopped(self) -> bool:
+        """Whether nothing hangs in the air on this process."""
+        return self.phase not in FLYING or (self.phase is Phase.LANDING and self._land_seen)
+
+    def unready(self, now: Instant) -> list[str]:
+        """Why this vehicle may not take off; empty when it may."""
+        reasons = self.autopilot.unready(now)
+        silent = [i for i, phase in self.peers.phases().items() if phase is None]
+        if silent:
+            reasons.append(f"not heard: vehicle {', '.join(str(i) for i in silent)}")
+        return reasons
+
+    # -- motions -----------------------------------------------------------------------------------------------------
+
+    def _consider(self, motion: Motion, now: Instant) -> str | None:
+        """Adopt a motion of somebody else's if it is newer and sound; returns why it was refused."""
+        if motion.order <= self.programme.newest.order:
+            known = self.programme.newest.order == motion.order
+            return None if known else f"revision {motion.revision} is not newer than {self.programme.newest.revision}"
+        refusal = self._unsound(motion, now)
+        if refusal is not None:
+            self.rejected[f"plan: {refusal}"] += 1
+            return refusal
+        self._adopt(motion, now)
+        return None
+
+    def _unsound(self, motion: Motion, now: Instant) -> str | None:
+        if set(motion.slots) != set(self.programme.newest.slots):
+            return "its vehicles are not this fleet's"
+        if abs(motion.start_ns - now.fleet_ns) > 3_600_000_000_000:
+            return "it starts more than an hour from now; are the clocks set?"
+        if motion.shape == "pads":
+            return None
+        try:
+            slots = self.config.slots(motion.shape)
+        except ConfigError as error:
+            return str(error)
+        if not assignment_matches(motion, slots, self.config.pinned):
+            return "its slots are not what this vehicle assigns; do the configurations differ?"
+        return None
+
+    def _adopt(self, motion: Motion, now: Instant) -> None:
+        blend = motion.blend_start_ns
+        changed = blend != self.programme.newest.blend_start_ns
+        if not self.programme.adopt(motion):
+            return
+        self.peers.plan_changed()
+        if self._sent is not None:
+            self._sent = (self._sent[0], self._reference_of(self._sent[0]))
+        if changed:
+            self._settled_since_ns = None
+            self._happened(PhaseEvent.UNSETTLED, now)
+        self._plan_due_ns = now.monotonic_ns if motion.issuer == self.id else None
+        self._announce(now)
+        self._outputs.notes.append(f"motion {motion.revision} ({motion.shape}) by {motion.issuer or 'the operator'}")
+
+    def _compare_motions(self, message: PeerMessage, now: Instant) -> None:
+        theirs = (message.sample.revision, message.motion_start_ns, message.motion_issuer)
+        ours = self.programme.newest.order
+        if theirs < ours and self._plan_due_ns is None:
+            self._plan_due_ns = now.monotonic_ns + self._random.randrange(CATCH_UP_NS)
+        self._behind = theirs > ours
+
+    def _propose(self, now: Instant) -> None:
+        """Go on by itself: form once all are in the air, fly the plan once all have formed."""
+        if not self.config.plan.automatic:
+            return
+        newest = self.programme.newest
+        phases = list(self.peers.phases().values())
+        start_ns = now.fleet_ns + PROPOSAL_DELAY_NS
+        if newest.revision == 0 and self.phase is Phase.FORMING and all(p in FILTERED_PHASES for p in phases):
+            self._adopt(self._formation_motion(self.config.formation.shape, start_ns), now)
+        elif newest.revision == 1 and self.phase is Phase.FORMED and not newest.legs and self._all_formed():
+            legs = self.config.plan_legs(newest.moment(start_ns).centre.position)
+            if legs:
+                self._adopt(
+                    with_legs(newest, at_ns=start_ns, issuer=self.id, legs=legs, then=self.config.plan.then), now
+                )
+
+    def _all_formed(self) -> bool:
+        """Every peer that is there has formed under the newest motion."""
+        for i, phase in self.peers.phases().items():
+            sample = self.peers.sample(i)
+            if phase is None:
+                continue
+            if phase is not Phase.FORMED or sample is None or sample.revision != self.programme.newest.revision:
+                return False
+        return True
+
+    def _formation_motion(self, shape: str, start_ns: int) -> Motion:
+        return with_formation(
+            self.programme.newest, at_ns=start_ns, issuer=self.id, shape=shape, slots=self.config.slots(shape),
+            pinned=self.config.pinned, speed_m_s=self.config.limits.speed_max_m_s / 2,
+        )  # fmt: skip
+
+    # -- time --------------------------------------------------------------------------------------------------------
+
+    def next_deadline_ns(self) -> int:
+        """When `advance` must be called at the latest (monotonic ns), if nothing arrives before."""
+        if self._position_came:
+            return 0
+        deadline = self.autopilot.next_deadline_ns()
+        if self._last_tick is not None:
+            deadline = min(deadline, self._last_tick.monotonic_ns + round(TIMER_SLACK * CONTROL_PERIOD_NS))
+        if self._plan_due_ns is not None:
+            deadline = min(deadline, self._plan_due_ns)
+        return deadline
+
+    def advance(self, now: Instant) -> Outputs:
+        """Do what is due; the returned outputs are to be sent in their order."""
+        since = None if self._last_tick is None else now.monotonic_ns - self._last_tick.monotonic_ns
+        if self._position_came or since is None or since >= TIMER_SLACK * CONTROL_PERIOD_NS:
+            self._control(now, since)
+        out = self._outputs
+        out.mavlink += self.autopilot.due(now)
+        if self._plan_due_ns is not None and now.monotonic_ns >= self._plan_due_ns:
+            self._plan_due_ns = None
+            out.peers.append(("plan", encode_motion(self.programme.newest)))
+        out.notes += self.autopilot.notes
+        self.autopilot.notes.clear()
+        self._outputs = Outputs()
+        return out
+
+    def _control(self, now: Instant, since_ns: int | None) -> None:
+        came, self._position_came = self._position_came, False
+        self._last_tick = now
+        dt_s = 0.0 if since_ns is None else since_ns * 1e-9
+        measured = self.autopilot.state(now)
+        self._watch(now, measured is not None)
+        if measured is None:
+            return
+        ego, bias = self._observe(measured, dt_s, now)
+        moment = self.programme.at(now.fleet_ns).moment(now.fleet_ns)
+        reference = moment.slot(self.programme.at(now.fleet_ns).slots[self.id])
+        neighbours = self.peers.predict(ego.position_ned_m, now, moment, self.phase is Phase.FORMED)
+        residual = ZERO
+        if self._steers():
+            command, residual = self._law(ego, reference, neighbours)
+            setpoint = self.safety.apply(command, ego, neighbours, bias, dt_s)
+            if setpoint is not None:
+                self._outputs.mavlink.append(self._encode(setpoint))
+                self.setpoints_sent += 1
+        self._settle(ego, reference, now)
+        self._propose(now)
+        self._tell(now, residual)
+        self._tick = self._outputs.tick = Tick(
+            now,
+            came,
+            dist(ego.position_ned_m, reference.position_ned_m),
+            sum(n.in_formation for n in neighbours),
+            min((dist(n.position_ned_m, ego.position_ned_m) for n in neighbours), default=-1.0),
+            self.safety.acceleration_m_s2,
+        )
+
+    def _steers(self) -> bool:
+        """Whether setpoints are streamed: in formation, before it to be let into OFFBOARD, and until landing begins."""
+        return (
+            self.phase in FILTERED_PHASES
+            or (self.phase is Phase.CLIMBING and self._mode_asked_ns > 0)
+            or (self.phase is Phase.LANDING and not self._land_seen and self.autopilot.custom_mode == Px4Mode.OFFBOARD)
+        )
+
+    def _observe(self, measured: tuple[Ned, Ned], dt_s: float, now: Instant) -> tuple[VehicleState, Ned]:
+        """The own state without the estimator's velocity bias, and that bias; the filter for sending goes along."""
+        position, velocity = measured
+        free = Ned(*(o.step(p, v, dt_s) for o, p, v in zip(self._bias, position, velocity, strict=True)))
+        flown = (*self.safety.acceleration_m_s2, 0.0) if self.phase in FILTERED_PHASES else (0.0, 0.0, 0.0)
+        for f, p, v, u in zip(self._filter, position, free, flown, strict=True):
+            f.step(p, v, u, dt_s)
+        return VehicleState(now.fleet_ns, position, free), Ned(*(o.bias_m_s for o in self._bias))
+
+    def _law(self, ego: VehicleState, reference: Reference, neighbours: list[Neighbour]) -> tuple[Command, Ned]:
+        """The law's command and the mean residual to the neighbours in formation.
+
+        Altitude is flown by position, so the vertical errors are left out of the horizontal budget.
+        """
+        p, v, g = ego.position_ned_m, ego.velocity_ned_m_s, self._gains
+        sums, count = NO_SUMS, 0
+        apart = (0.0, 0.0)
+        for n in neighbours:
+            q, w, d = n.position_ned_m, n.velocity_ned_m_s, n.offset_ned_m
+            dx, dy, dz = p.north - q.north, p.east - q.east, p.down - q.down
+            if n.in_formation:
+                count += 1
+                one = pair(dx, dy, dz, v.north - w.north, v.east - w.east, 0.0, d.north, d.east, dz, g)
+                sums = add(sums, one)
+            elif n.other_end_ned_m is None:
+                s = separation(dx, dy, dz, g)
+                apart = (apart[0] + s[0], apart[1] + s[1])
+        sums = sums._replace(sep_x=sums.sep_x + apart[0], sep_y=sums.sep_y + apart[1], sep_z=0.0)
+        r, rv, ra, yaw = reference
+        u = finish(
+            count, sums,
+            p.north - r.north, p.east - r.east, 0.0,
+            v.north - rv.north, v.east - rv.east, 0.0,
+            ra.north, ra.east, 0.0,
+            g,
+        )  # fmt: skip
+        share = 1.0 / count if count else 0.0
+        return Command(Ned(*u), r, rv, ra, yaw), Ned(sums.res_x * share, sums.res_y * share, 0.0)
+
+    def _encode(self, s: SafeSetpoint) -> bytes:
+        frame = self.autopilot.frame
+        assert frame is not None  # a state exists, so the frame does
+        down = s.position_down_m - frame.origin_in_fleet_ned_m.down
+        return self.link.setpoint(
+            self.autopilot.boot.last_boot_ms,
+            down,
+            Ned(s.velocity_north_m_s, s.velocity_east_m_s, s.velocity_down_m_s),
+            (s.acceleration_north_m_s2, s.acceleration_east_m_s2),
+            s.yaw_rad,
+        )
+
+    # -- phases ------------------------------------------------------------------------------------------------------
+
+    def _happened(self, event: PhaseEvent, now: Instant) -> None:
+        after = next_phase(self.phase, event)
+        if after is self.phase:
+            return
+        self._outputs.notes.append(f"{self.phase.name.lower()} -> {after.name.lower()}: {event.value}")
+        self.phase = after
+        self._phase_since_ns = now.monotonic_ns
+        self._settled_since_ns = None
+        self._mode_asked_ns = 0
+        if after is Phase.FORMING and event is PhaseEvent.ENGAGED:
+            self.safety.reset()
+            self._formation_since_ns = now.fleet_ns
+        if after is Phase.LANDING:
+            self._land_seen = False
+        if after is Phase.RELEASED:
+            self.autopilot.cancel()
+            self._failsafe(f"autopilot left our control: {mode_name(self.autopilot.custom_mode)}")
+        self._announce(now)
+
+    def _failsafe(self, reason: str) -> None:
+        self.failsafes.append(reason)
+        self._outputs.notes.append(f"failsafe: {reason}")
+
+    def _watch(self, now: Instant, positioned: bool) -> None:
+        """Lead the autopilot through the flight, and notice when it does something else."""
+        ap = self.autopilot
+        match self.phase:
+            case Phase.IDLE:
+                if self._take_off_wanted:
+                    if ap.armed:
+                        self._happened(PhaseEvent.ARMED, now)
+                    else:
+                        ap.ask("arming", *wire.arm_parameters(True))
+            case Phase.ARMED:
+                self._take_off_wanted = False
+                if not ap.armed:
+                    self._happened(PhaseEvent.DISARMED, now)
+                elif ap.custom_mode == Px4Mode.AUTO_TAKEOFF:
+                    self._happened(PhaseEvent.TAKING_OFF, now)
+                else:
+                    altitude = self.config.origin.altitude_amsl_m + self.config.formation.altitude_m
+                    if self.config.fleet.frame == "local":
+                        altitude = float("nan")
+                    ap.ask("take-off", *wire.takeoff_parameters(altitude))
+            case Phase.CLIMBING:
+                self._watch_climb(now)
+            case Phase.FORMING | Phase.FORMED:
+                self._watch_flight(now, positioned)
+            case Phase.LANDING:
+                self._watch_landing(now)
+            case Phase.RELEASED:
+                if not ap.armed:
+                    self._happened(PhaseEvent.DISARMED, now)
+            case Phase.LANDED:
+                pass
+
+    def _watch_climb(self, now: Instant) -> None:
+        ap = self.autopilot
+        if not ap.armed:
+            self._happened(PhaseEvent.DISARMED, now)
+            return
+        if ap.custom_mode == Px4Mode.OFFBOARD:
+            self._happened(PhaseEvent.ENGAGED, now)
+            return
+        if ap.custom_mode not in (Px4Mode.AUTO_TAKEOFF, Px4Mode.AUTO_LOITER):
+            self._happened(PhaseEvent.TAKEN_OVER, now)
+            return
+        height = self.config.formation.altitude_m
+        reached = -ap.position_ned_m.down > height - ALTITUDE_TOLERANCE_M
+        if self._mode_asked_ns or reached or ap.custom_mode == Px4Mode.AUTO_LOITER:
+            if not self._mode_asked_ns:
+                self._mode_asked_ns = now.monotonic_ns
+                self.safety.reset()
+            elif now.monotonic_ns - self._mode_asked_ns > 200_000_000:
+                ap.set_mode(Px4Mode.OFFBOARD)
+        if now.monotonic_ns - self._phase_since_ns > CLIMB_LIMIT_NS:
+            self._failsafe("altitude not reached in time: landing")
+            self._happened(PhaseEvent.LAND, now)
+
+    def _watch_flight(self, now: Instant, positioned: bool) -> None:
+        ap = self.autopilot
+        if not ap.armed:
+            self._happened(PhaseEvent.DISARMED, now)
+            return
+        if ap.custom_mode != Px4Mode.OFFBOARD:
+            self._happened(PhaseEvent.TAKEN_OVER, now)
+            return
+        if not positioned:
+            if not self.failsafes or self.failsafes[-1] != "own position stale: no setpoints":
+                self._failsafe("own position stale: no setpoints")
+            return
+        motion = self.programme.at(now.fleet_ns)
+        if motion.then == "land" and motion.end_ns is not None and now.fleet_ns >= motion.end_ns:
+            self._happened(PhaseEvent.LAND, now)
+            return
+        waiting_s = (now.monotonic_ns - self._phase_since_ns) * 1e-9
+        if self.programme.newest.revision == 0 and self.config.plan.automatic and waiting_s > self.config.peers.wait_s:
+            self._failsafe("waited for the others in vain: landing")
+            self._happened(PhaseEvent.LAND, now)
+            return
+        silent_s = self.peers.silent_for_s(now)
+        if silent_s is not None and silent_s > self.config.peers.isolated_flight_s:
+            self._failsafe("all peers lost: landing")
+            self._happened(PhaseEvent.LAND, now)
+
+    def _watch_landing(self, now: Instant) -> None:
+        ap = self.autopilot
+        if not ap.armed:
+            self._happened(PhaseEvent.DISARMED, now)
+        elif ap.custom_mode == Px4Mode.AUTO_LAND:
+            self._land_seen = True
+        elif self._land_seen:
+            self._happened(PhaseEvent.TAKEN_OVER, now)
+        else:
+            ap.set_mode(Px4Mode.AUTO_LAND)
+
+    def _settle(self, ego: VehicleState, reference: Reference, now: Instant) -> None:
+        motion = self.programme.at(now.fleet_ns)
+        if self.phase is not Phase.FORMING or motion.shape == "pads" or now.fleet_ns < motion.blend_end_ns:
+            return
+        p, r = ego.position_ned_m, reference.position_ned_m
+        near = hypot(p.north - r.north, p.east - r.east) < SETTLED_TOLERANCE_M and abs(p.down - r.down) < 1.0
+        if not near:
+            self._settled_since_ns = None
+        elif self._settled_since_ns is None:
+            self._settled_since_ns = now.monotonic_ns
+        elif now.monotonic_ns - self._settled_since_ns >= SETTLED_FOR_NS:
+            self._happened(PhaseEvent.SETTLED, now)
+
+    # -- telling the peers -------------------------------------------------------------------------------------------
+
+    def _announce(self, now: Instant) -> None:
+        """Say something at once and again, whatever the trigger says."""
+        self._resend_ns = [now.monotonic_ns, *(now.monotonic_ns + d for d in RESEND_NS)]
+
+    def _reference_of(self, sample: PeerSample) -> tuple[Ned, Ned]:
+        reference = self.programme.reference(self.id, sample.time_ns)
+        return reference.position_ned_m, reference.velocity_ned_m_s
+
+    def _tell(self, now: Instant, residual: Ned) -> None:
+        since_s = (now.monotonic_ns - self._sent_ns) * 1e-9
+        due = bool(self._resend_ns) and now.monotonic_ns >= self._resend_ns[0]
+        if due:
+            self._resend_ns = [t for t in self._resend_ns if t > now.monotonic_ns]
+        if self._behind and since_s >= CATCH_UP_NS * 1e-9:
+            due = True
+        filtered = tuple(f.position_m or 0.0 for f in self._filter), tuple(f.velocity_m_s for f in self._filter)
+        position, velocity = Ned(*filtered[0]), Ned(*filtered[1])
+        if not due and self._sent is not None:
+            due = self._spacing.decide(
+                since_s, self._silence_limit_s, self._fires(position, velocity, residual, since_s, now)
+            )
+        if not due and self._sent is not None:
+            return
+        sample = PeerSample(self.id, now.fleet_ns, position, velocity, self.programme.newest.revision, self.phase)
+        self._sent = (sample, self._reference_of(sample))
+        self._sent_ns = now.monotonic_ns
+        self._silence_limit_s = self._spacing.t_max_s * (0.8 + 0.2 * self._random.random())
+        self._sequence = (self._sequence + 1) % (1 << 32)
+        newest = self.programme.newest
+        message = PeerMessage(self.boot_id, self._sequence, newest.start_ns, newest.issuer, sample, self.peers.digest())
+        self._outputs.peers.append(("state", encode_state(message)))
+        self.messages_sent += 1
+
+    def _fires(self, position: Ned, velocity: Ned, residual: Ned, since_s: float, now: Instant) -> bool:
+        assert self._sent is not None
+        sample, reference_then = self._sent
+        reference = self.programme.reference(self.id, now.fleet_ns)
+        p, v = held(sample, reference_then, reference, now.fleet_ns, self.peers.limits)
+        error_p = (position.north - p.north) ** 2 + (position.east - p.east) ** 2 + (position.down - p.down) ** 2
+        error_v = (velocity.north - v.north) ** 2 + (velocity.east - v.east) ** 2 + (velocity.down - v.down) ** 2
+        match self.config.trigger.kind:
+            case "error":
+                return exceeds(error_p, error_v, residual.north**2 + residual.east**2, self._error_trigger)
+            case "switching":
+                start = now.fleet_ns if self._formation_since_ns is None else self._formation_since_ns
+                return switching_exceeds(error_p, error_v, (now.fleet_ns - start) * 1e-9, self._switching_trigger)
+            case "periodic":
+                return since_s >= self.config.trigger.period_s - 1e-3
+
+    # -- telling the operator ----------------------------------------------------------------------------------------
+
+    def status(self, now: Instant) -> dict[str, Any]:
+        """What the operator's table shows; plain values."""
+        tick = self._tick
+        age = self.peers.oldest_age_s(now)
+        return {
+            "vehicle": self.id,
+            "phase": self.phase.name.lower(),
+            "mode": mode_name(self.autopilot.custom_mode),
+            "armed": self.autopilot.armed,
+            "ready": self.unready(now),
+            "revision": self.programme.newest.revision,
+            "shape": self.programme.newest.shape,
+            "moving": self.programme.newest.end_ns is None or bool(self.programme.newest.legs),
+            "position_error_m": tick.position_error_m if tick else None,
+            "neighbours": tick.neighbours if tick else 0,
+            "nearest_m": tick.nearest_m if tick and tick.nearest_m >= 0 else None,
+            "oldest_age_s": age,
+            "messages": self.messages_sent,
+            "setpoints": self.setpoints_sent,
+            "battery_percent": self.autopilot.battery_percent,
+            "configuration": self.config.shared_hash,
+            "failsafes": list(self.failsafes),
+            "rejected": dict(
+                self.rejected + self.peers.rejected + self.link.counts + self.autopilot.counts + self.safety.counts
+            ),
+            "motion": json.loads(encode_motion(self.programme.newest)),
+        }

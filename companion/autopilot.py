@@ -1,0 +1,257 @@
+"""What we know of our autopilot and what we have asked of it. Sans-I/O; used by the agent alone.
+
+PX4's quirks that shape it: an answer to a command names only the command, so commands of one kind are asked one after
+another; GPS_GLOBAL_ORIGIN comes once after boot and must be requested; LOCAL_POSITION_NED says nothing of its validity.
+"""
+
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from math import inf
+
+from companion.core.frames import Geodetic, LocalFrame, Ned
+from companion.core.values import ZERO, Instant
+from companion.wire import mavlink as wire
+from companion.wire.mavlink import MavlinkLink, Px4Mode
+
+RETRY_S = 0.5
+TRIES = 8
+HEARTBEAT_LIMIT_S = 3.0
+POSITION_LIMIT_S = 0.5
+"""a position older than this is stale: no setpoint is made from it"""
+LATENCY_WINDOW_NS = 5_000_000_000
+ESTIMATOR_FLAGS_NEEDED = 1 | 2 | 4
+"""ESTIMATOR_STATUS: attitude, horizontal and vertical velocity"""
+ESTIMATOR_GLOBAL_FLAG = 16
+"""absolute horizontal position"""
+ESTIMATOR_RELATIVE_FLAG = 8
+ACCEPTED, TEMPORARILY_REJECTED = 0, 1
+
+
+@dataclass(slots=True)
+class _Request:
+    name: str
+    make: Callable[[], bytes]
+    tries: int = 0
+    next_ns: int = 0
+
+
+@dataclass(slots=True)
+class BootClock:
+    """The autopilot's boot time on our monotonic clock: the least delayed message of the last seconds tells the offset.
+
+    A message's age beyond that is the delay it met on its way.
+    """
+
+    _window: deque[tuple[int, int]] = field(default_factory=deque)
+    """(arrival, offset), offsets rising: a monotonic queue, so that the front is the window's minimum"""
+    last_boot_ms: int = -1
+
+    def restart(self) -> None:
+        """Forget: the autopilot has booted anew."""
+        self._window.clear()
+        self.last_boot_ms = -1
+
+    def arrived(self, boot_ms: int, monotonic_ns: int) -> int:
+        """When the message was made (monotonic ns), given when it arrived."""
+        offset = monotonic_ns - boot_ms * 1_000_000
+        while self._window and self._window[-1][1] >= offset:
+            self._window.pop()
+        self._window.append((monotonic_ns, offset))
+        while self._window[0][0] < monotonic_ns - LATENCY_WINDOW_NS:
+            self._window.popleft()
+        self.last_boot_ms = boot_ms
+        return boot_ms * 1_000_000 + self._window[0][1]
+
+
+class AutopilotClient:
+    """One autopilot as seen over its link."""
+
+    def __init__(self, link: MavlinkLink, fleet_origin: Geodetic | None) -> None:
+        self.link = link
+        self.counts: Counter[str] = Counter()
+        self.notes: list[str] = []
+        """what happened, for the log; emptied by the agent"""
+        self.fleet_origin = fleet_origin
+        self.armed = False
+        self.custom_mode = 0
+        self.autopilot_kind = -1
+        self.landed_state = 0
+        self.battery_percent = -1
+        self.estimator_flags = 0
+        self.horizontal_accuracy_m = inf
+        self.origin: Geodetic | None = None
+        self.frame: LocalFrame | None = None if fleet_origin is not None else LocalFrame(ZERO)
+        self.boot = BootClock()
+        self.heartbeat_ns: int | None = None
+        self.position_ns: int | None = None
+        """when the latest position was made, on our monotonic clock"""
+        self.position_ned_m = ZERO
+        """fleet frame"""
+        self.velocity_ned_m_s = ZERO
+        self._queues: dict[int, deque[_Request]] = {}
+        self._next_heartbeat_ns = 0
+        self._next_origin_ns = 0
+
+    def receive(self, datagram: bytes, now: Instant) -> bool:
+        """Take a datagram; True if it brought a position."""
+        fresh = False
+        for event in self.link.decode(datagram):
+            match event:
+                case wire.LocalPosition():
+                    fresh = self._position(event, now) or fresh
+                case wire.Heartbeat():
+                    self._heartbeat(event, now)
+                case wire.CurrentMode():
+                    self.custom_mode = event.custom_mode
+                case wire.LandedState():
+                    self.landed_state = event.state
+                case wire.GlobalOrigin():
+                    self._origin(event.origin)
+                case wire.EstimatorHealth():
+                    self.estimator_flags = event.flags
+                    self.horizontal_accuracy_m = event.horizontal_accuracy_m
+                case wire.SystemHealth():
+                    self.battery_percent = event.battery_percent
+                case wire.CommandAnswer():
+                    self._answer(event, now)
+                case wire.Parameter():
+                    pass
+        return fresh
+
+    def _heartbeat(self, event: wire.Heartbeat, now: Instant) -> None:
+        first = self.heartbeat_ns is None
+        self.heartbeat_ns = now.monotonic_ns
+        self.armed = event.armed
+        self.custom_mode = event.custom_mode
+        self.autopilot_kind = event.autopilot
+        if first:
+            self._set_up()
+
+    def _set_up(self) -> None:
+        """Ask for what we read, and for no more: a companion's link may be a serial line."""
+        for message_id, rate_hz in wire.STREAMS_HZ.items():
+            self.ask(f"stream {message_id}", *wire.interval_parameters(message_id, rate_hz))
+        for message_id in wire.STREAMS_OFF:
+            self.ask(f"stream {message_id}", *wire.interval_parameters(message_id, 0.0))
+
+    def _position(self, event: wire.LocalPosition, now: Instant) -> bool:
+        if event.boot_ms < self.boot.last_boot_ms - 1000:
+            self.notes.append("autopilot rebooted")
+            self.counts["autopilot reboot"] += 1
+            self.boot.restart()
+            self.origin = None
+            if self.fleet_origin is not None:
+                self.frame = None
+            self._queues.clear()
+            self._set_up()
+        elif event.boot_ms <= self.boot.last_boot_ms:
+            self.counts["position repeated"] += 1
+            return False
+        made_ns = self.boot.arrived(event.boot_ms, now.monotonic_ns)
+        if self.frame is None:
+            return False
+        self.position_ns = made_ns
+        self.position_ned_m = self.frame.to_fleet(event.position_local_ned_m)
+        self.velocity_ned_m_s = event.velocity_ned_m_s
+        return True
+
+    def _origin(self, origin: Geodetic) -> None:
+        if self.fleet_origin is None or origin == self.origin:
+            return
+        if self.origin is not None:
+            self.notes.append("estimator origin moved")
+            self.counts["estimator origin moved"] += 1
+        self.origin = origin
+        self.frame = LocalFrame.from_origins(origin, self.fleet_origin)
+
+    def _answer(self, event: wire.CommandAnswer, now: Instant) -> None:
+        queue = self._queues.get(event.command)
+        if not queue or queue[0].tries == 0:
+            self.counts["answer to nothing asked"] += 1
+            return
+        request = queue[0]
+        if event.result == TEMPORARILY_REJECTED and request.tries < TRIES:
+            request.next_ns = now.monotonic_ns + round(RETRY_S * 1e9)
+            return
+        queue.popleft()
+        if event.result != ACCEPTED:
+            self.counts[f"refused: {request.name.split()[0]}"] += 1
+            if not request.name.startswith("stream"):
+                self.notes.append(f"autopilot refused {request.name} (result {event.result})")
+
+    def ask(self, name: str, command: int, *parameters: float) -> None:
+        """Ask for a command, retried until answered; the same name is not queued twice."""
+        queue = self._queues.setdefault(command, deque())
+        if all(r.name != name for r in queue):
+            queue.append(_Request(name, lambda: self.link.command(command, *parameters)))
+
+    def set_mode(self, mode: Px4Mode) -> None:
+        """Ask for a flight mode; one asked for before and not answered is dropped."""
+        command, *parameters = wire.mode_parameters(mode)
+        queue = self._queues.get(command)
+        if queue and queue[0].name != mode.name:
+            queue.clear()
+        self.ask(mode.name, command, *parameters)
+
+    def cancel(self) -> None:
+        """Ask for nothing more: the vehicle is somebody else's now."""
+        self._queues.clear()
+
+    def due(self, now: Instant) -> list[bytes]:
+        """Datagrams to send now: heartbeat at 1 Hz, requests with their retries."""
+        out = []
+        if now.monotonic_ns >= self._next_heartbeat_ns:
+            out.append(self.link.heartbeat())
+            self._next_heartbeat_ns = now.monotonic_ns + 1_000_000_000
+        if self.heartbeat_ns is None:
+            return out
+        if self.origin is None and self.fleet_origin is not None and now.monotonic_ns >= self._next_origin_ns:
+            self._next_origin_ns = now.monotonic_ns + 1_000_000_000
+            out.append(self.link.command(*wire.request_message_parameters(wire.ORIGIN_MESSAGE_ID)))
+        for queue in self._queues.values():
+            while queue and queue[0].tries >= TRIES and now.monotonic_ns >= queue[0].next_ns:
+                self.counts["unanswered"] += 1
+                self.notes.append(f"autopilot never answered {queue.popleft().name}")
+            if queue and now.monotonic_ns >= queue[0].next_ns:
+                queue[0].tries += 1
+                queue[0].next_ns = now.monotonic_ns + round(RETRY_S * 1e9)
+                out.append(queue[0].make())
+        return out
+
+    def next_deadline_ns(self) -> int:
+        """When `due` next has something to say (monotonic ns)."""
+        times = [self._next_heartbeat_ns]
+        times += [queue[0].next_ns for queue in self._queues.values() if queue]
+        if self.heartbeat_ns is not None and self.origin is None and self.fleet_origin is not None:
+            times.append(self._next_origin_ns)
+        return min(times)
+
+    def state(self, now: Instant) -> tuple[Ned, Ned] | None:
+        """Position and velocity now (fleet frame), the latest carried on by its age; None when stale."""
+        if self.position_ns is None:
+            return None
+        age_s = (now.monotonic_ns - self.position_ns) * 1e-9
+        if age_s > POSITION_LIMIT_S:
+            return None
+        p, v = self.position_ned_m, self.velocity_ned_m_s
+        return Ned(p.north + v.north * age_s, p.east + v.east * age_s, p.down + v.down * age_s), v
+
+    def unready(self, now: Instant) -> list[str]:
+        """Why the vehicle may not take off; empty when it may."""
+        if self.heartbeat_ns is None:
+            return ["no heartbeat from the autopilot"]
+        reasons = []
+        if now.monotonic_ns - self.heartbeat_ns > HEARTBEAT_LIMIT_S * 1e9:
+            reasons.append(f"no heartbeat for {(now.monotonic_ns - self.heartbeat_ns) * 1e-9:.0f} s")
+        if self.autopilot_kind != wire.AUTOPILOT_PX4:
+            reasons.append(f"autopilot is no PX4 (MAV_AUTOPILOT {self.autopilot_kind})")
+        if self.frame is None:
+            reasons.append("estimator origin unknown")
+        elif self.state(now) is None:
+            reasons.append(f"no position within {POSITION_LIMIT_S} s")
+        wanted = ESTIMATOR_FLAGS_NEEDED
+        wanted |= ESTIMATOR_GLOBAL_FLAG if self.fleet_origin is not None else ESTIMATOR_RELATIVE_FLAG
+        if self.estimator_flags & wanted != wanted:
+            reasons.append(f"estimator not ready (flags {self.estimator_flags:#x}, needs {wanted:#x})")
+        return reasons

@@ -1,0 +1,643 @@
+"""fleet.toml: one file for the whole fleet, validated into frozen values.
+
+Every key has a range and a unit (its suffix); an unknown key is refused. Names of units: `_m` metres, `_s` seconds,
+`_m_s` metres per second, `_deg` degrees. The derived values that the vehicles must agree on exactly (pads, slots, the
+first motion, the gains, the safety radius) are computed here from the file alone.
+"""
+
+import json
+import re
+import tomllib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cached_property
+from hashlib import blake2s
+from math import ceil, inf, radians, sqrt
+from pathlib import Path
+from typing import Annotated, Any, Literal
+from urllib.parse import urlsplit
+
+import annotated_types
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from companion.core.formation import SHAPES, Slots, centred, minimum_distance, rotated, shape_slots
+from companion.core.frames import Geodetic, Ned
+from companion.core.hold import HoldKind
+from companion.core.law import Gains, paper_gains
+from companion.core.monitor import prediction_error_bound_m
+from companion.core.neighbours import PeerLimits
+from companion.core.plan import GotoLeg, Leg, Motion, SlotChange, TurnLeg, VelocityLeg, goto_duration_s
+from companion.core.safety import DOWNWASH_RATIO, SafetyLimits, safety_radius_m
+from companion.core.trigger import ErrorTrigger, Spacing, SwitchingTrigger, TriggerKind
+from companion.core.values import ZERO
+from companion.errors import ConfigError
+
+Real = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+VehicleId = Annotated[int, Field(ge=1, le=250)]
+
+SPACING_MARGIN_M = 0.2
+"""slots stay this much farther apart than separation and barrier begin to act"""
+LOOP_LATENCY_S = 0.12
+"""control period, delay to a peer and t_min together, as the error bound takes them"""
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+class OriginTable(_Table):
+    """Origin of the fleet frame."""
+
+    latitude_deg: Annotated[float, Field(ge=-90, le=90, allow_inf_nan=False)]
+    longitude_deg: Annotated[float, Field(ge=-180, le=180, allow_inf_nan=False)]
+    altitude_amsl_m: Annotated[float, Field(ge=-500, le=9000, allow_inf_nan=False)]
+
+
+class FleetTable(_Table):
+    """Name and frame."""
+
+    name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]{0,31}$")]
+    frame: Literal["global", "local"] = "global"
+    """global: autopilots know their place on earth; local: they share one local frame (motion capture)"""
+    origin: OriginTable | None = None
+
+
+class FormationTable(_Table):
+    """The first formation."""
+
+    shape: str = "v"
+    spacing_m: Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)] = 4.0
+    heading_deg: Annotated[float, Field(ge=-360, le=360, allow_inf_nan=False)] = 0.0
+    altitude_m: Annotated[float, Field(ge=1, le=500, allow_inf_nan=False)] = 10.0
+    """above the fleet origin"""
+    custom_m: tuple[tuple[Real, Real, Real], ...] = ()
+    """slots of shape "custom": forward, right, down"""
+
+
+class HoldLegTable(_Table):
+    kind: Literal["hold"]
+    duration_s: NotNegative
+
+
+class VelocityLegTable(_Table):
+    kind: Literal["velocity"]
+    north_m_s: Real = 0.0
+    east_m_s: Real = 0.0
+    up_m_s: Real = 0.0
+    duration_s: Positive
+
+
+class TurnLegTable(_Table):
+    kind: Literal["turn"]
+    rate_deg_s: Annotated[float, Field(ge=-60, le=60, allow_inf_nan=False)]
+    """positive turns right"""
+    angle_deg: Annotated[float, Field(gt=0, le=36000, allow_inf_nan=False)] | None = None
+    """None circles for ever"""
+
+
+class GotoLegTable(_Table):
+    kind: Literal["goto"]
+    north_m: Real
+    east_m: Real
+    altitude_m: Annotated[float, Field(ge=1, le=500, allow_inf_nan=False)] | None = None
+    speed_m_s: Positive = 1.0
+
+
+LegTable = Annotated[HoldLegTable | VelocityLegTable | TurnLegTable | GotoLegTable, Field(discriminator="kind")]
+
+
+class PlanTable(_Table):
+    """How the formation moves once all have formed."""
+
+    legs: tuple[LegTable, ...] = ()
+    heading: Literal["fixed", "track"] = "fixed"
+    """track: the formation's heading follows turns"""
+    then: Literal["stay", "land"] = "stay"
+    automatic: bool = True
+    """the fleet forms and starts the plan by itself; false: it waits for the operator's commands"""
+
+
+class LawTable(_Table):
+    """Gains of the law."""
+
+    kind: Literal["starling", "paper"] = "starling"
+    hold: HoldKind = "damped"
+    hold_damping_s: Positive = 0.7
+    k_s: NotNegative = 3.0
+    k_a: NotNegative = 3.0
+    k_c: NotNegative = 4.0
+    k_v: NotNegative = 1.0
+    k_p: NotNegative = 0.3
+    a_max_m_s2: Annotated[float, Field(gt=0, le=20, allow_inf_nan=False)] = 5.0
+    r0_m: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+    """range of separation; None: half the spacing"""
+
+
+class TriggerTable(_Table):
+    """When to tell the peers."""
+
+    kind: TriggerKind = "error"
+    epsilon_m: Positive = 0.3
+    gamma_s2: Positive = 0.1
+    kappa: NotNegative = 0.3
+    t_min_s: NotNegative = 0.05
+    t_max_s: Annotated[float, Field(gt=0, le=60, allow_inf_nan=False)] = 10.0
+    period_s: Positive = 0.05
+    """of kind "periodic" """
+    alpha: NotNegative = 0.1
+    beta: NotNegative = 0.3
+    delta_min: Positive = 0.01
+    delta_f: Positive = 0.02
+    eta: NotNegative = 0.3
+
+
+class LimitsTable(_Table):
+    """Limits on every setpoint, and what the vehicles are assumed to measure."""
+
+    speed_max_m_s: Annotated[float, Field(gt=0, le=12, allow_inf_nan=False)] = 4.0
+    climb_max_m_s: Annotated[float, Field(gt=0, le=3, allow_inf_nan=False)] = 1.5
+    descent_max_m_s: Annotated[float, Field(gt=0, le=1.5, allow_inf_nan=False)] = 1.0
+    jerk_max_m_s3: Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)] = 100.0
+    avoidance_acceleration_m_s2: Annotated[float, Field(gt=0, le=8, allow_inf_nan=False)] = 8.0
+    barrier: bool = True
+    position_noise_m: NotNegative = 0.05
+    velocity_noise_m_s: NotNegative = 0.05
+    gust_m_s2: NotNegative = 0.3
+
+
+class PeersTable(_Table):
+    """Exchange between the vehicles."""
+
+    range_m: Positive = 100.0
+    digest: Annotated[int, Field(ge=0, le=30)] = 3
+    """how many peers' latest samples a message carries"""
+    wait_s: Positive = 60.0
+    """how long a vehicle in the air waits for the others before it lands"""
+    isolated_flight_s: Positive = 5.0
+    """how long a vehicle that hears nobody flies on before it holds"""
+    network: Literal["laptop", "field"] = "laptop"
+    scouting_port: Annotated[int, Field(ge=1024, le=65535)] | None = None
+    """multicast port by which a laptop's vehicles find each other; None: from the fleet's name"""
+
+
+class LaunchTable(_Table):
+    """The pads: a grid about the fleet origin, for vehicles that name no pad."""
+
+    spacing_m: Positive = 4.0
+    heading_deg: Real = 0.0
+
+
+class StubTable(_Table):
+    """What stub autopilots simulate."""
+
+    position_noise_m: NotNegative = 0.05
+    velocity_noise_m_s: NotNegative = 0.05
+    gust_m_s2: NotNegative = 0.3
+    lag_s: NotNegative = 0.15
+    drag_per_s: NotNegative = 0.2
+    origin_scatter_m: NotNegative = 5.0
+    """how far each estimator's origin lies from its vehicle's pad"""
+    dynamics: Literal["px4", "ideal"] = "px4"
+
+
+class VehicleTable(_Table):
+    """One vehicle."""
+
+    id: VehicleId
+    system_id: VehicleId | None = None
+    """MAVLink system id; None: the id"""
+    mavlink: str | None = None
+    """udp://HOST:PORT to listen on, or serial:///dev/NAME:BAUD; None: the port that PX4's instance id - 1 sends to"""
+    zenoh: str | None = None
+    """endpoint to listen on, as tcp/HOST:PORT; None: found by scouting"""
+    slot: Annotated[int, Field(ge=0, le=249)] | Literal["auto"] = "auto"
+    pad_m: tuple[Real, Real] | None = None
+    """north, east of the fleet origin; None: the launch grid's next"""
+    enabled: bool = True
+
+
+class Vehicle(_Table):
+    """One vehicle with every default resolved."""
+
+    id: int
+    instance: int
+    """position in the file, from 0: ports and pads follow it"""
+    system_id: int
+    mavlink: str
+    zenoh: str | None
+    slot: int | Literal["auto"]
+    pad_north_m: float
+    pad_east_m: float
+
+
+class FleetConfig(_Table):
+    """The whole of fleet.toml."""
+
+    fleet: FleetTable
+    formation: FormationTable = FormationTable()
+    plan: PlanTable = PlanTable()
+    law: LawTable = LawTable()
+    trigger: TriggerTable = TriggerTable()
+    limits: LimitsTable = LimitsTable()
+    peers: PeersTable = PeersTable()
+    launch: LaunchTable = LaunchTable()
+    stub: StubTable = StubTable()
+    vehicle: Annotated[tuple[VehicleTable, ...], Field(min_length=1, max_length=250)]
+
+    @cached_property
+    def vehicles(self) -> tuple[Vehicle, ...]:
+        """The enabled vehicles, in the file's order."""
+        pads = self._grid_pads()
+        return tuple(
+            Vehicle(
+                id=v.id,
+                instance=k,
+                system_id=v.id if v.system_id is None else v.system_id,
+                mavlink=v.mavlink or f"udp://127.0.0.1:{companion_port(k)}",
+                zenoh=v.zenoh,
+                slot=v.slot,
+                pad_north_m=pads[k].north if v.pad_m is None else v.pad_m[0],
+                pad_east_m=pads[k].east if v.pad_m is None else v.pad_m[1],
+            )
+            for k, v in enumerate(self.vehicle)
+            if v.enabled
+        )
+
+    def _grid_pads(self) -> Slots:
+        """Two wide rows behind each other, as one lays vehicles out on a field."""
+        n = len(self.vehicle)
+        across = max(ceil(sqrt(2.5 * n)), 1)
+        s = self.launch.spacing_m
+        cells = [(-s * (k // across), s * (k % across), 0.0) for k in range(n)]
+        return rotated(centred(cells), radians(self.launch.heading_deg))
+
+    def by_id(self, vehicle_id: int) -> Vehicle:
+        """The enabled vehicle of that id; refused if there is none."""
+        for vehicle in self.vehicles:
+            if vehicle.id == vehicle_id:
+                return vehicle
+        known = ", ".join(str(v.id) for v in self.vehicles)
+        raise ConfigError(f"vehicle {vehicle_id} is not an enabled vehicle of this fleet; there are {known}")
+
+    @property
+    def origin(self) -> Geodetic:
+        """Origin of the fleet frame; of no meaning in the local frame."""
+        o = self.fleet.origin
+        return Geodetic(0.0, 0.0, 0.0) if o is None else Geodetic(o.latitude_deg, o.longitude_deg, o.altitude_amsl_m)
+
+    @property
+    def r0_m(self) -> float:
+        """Range of separation."""
+        return self.formation.spacing_m / 2 if self.law.r0_m is None else self.law.r0_m
+
+    @property
+    def gains(self) -> Gains:
+        """The law's gains: ours, or Eq. (2) of the paper as it stands within the acceleration limit."""
+        law = self.law
+        if law.kind == "paper":
+            return paper_gains(law.k_s, law.k_a, law.k_c, self.r0_m)._replace(a_max=law.a_max_m_s2)
+        return Gains(law.k_s, law.k_a, law.k_c, law.k_v, law.k_p, self.r0_m, law.a_max_m_s2, 1.0, 1.0, 1.0)
+
+    @property
+    def error_trigger(self) -> ErrorTrigger:
+        t = self.trigger
+        return ErrorTrigger(t.epsilon_m, t.gamma_s2, t.kappa)
+
+    @property
+    def switching_trigger(self) -> SwitchingTrigger:
+        t = self.trigger
+        return SwitchingTrigger(t.gamma_s2, t.alpha, t.beta, t.delta_min, t.delta_f, t.eta)
+
+    @property
+    def message_spacing(self) -> Spacing:
+        return Spacing(self.trigger.t_min_s, self.trigger.t_max_s)
+
+    @property
+    def prediction_error_m(self) -> float:
+        """Bound on how far a peer that is heard may be from its prediction (m)."""
+        t, limits = self.trigger, self.limits
+        epsilon = {"error": t.epsilon_m, "switching": sqrt(max(t.alpha + t.delta_min, t.delta_f))}.get(t.kind, 0.1)
+        return prediction_error_bound_m(
+            epsilon_m=epsilon, gamma_s2=t.gamma_s2, sigma_p_m=limits.position_noise_m,
+            sigma_v_m_s=limits.velocity_noise_m_s, sigma_gust_m_s2=limits.gust_m_s2,
+            a_max_m_s2=self.law.a_max_m_s2, latency_s=LOOP_LATENCY_S,
+        )  # fmt: skip
+
+    @property
+    def safety_radius_m(self) -> float:
+        """Distance that the barrier keeps from a peer that is heard (m)."""
+        return safety_radius_m(self.prediction_error_m)
+
+    @property
+    def spacing_min_m(self) -> float:
+        """Smallest distance of two slots that leaves separation and barrier alone (m)."""
+        barrier = self.safety_radius_m if self.limits.barrier else 0.0
+        return max(self.r0_m, barrier) + SPACING_MARGIN_M
+
+    @property
+    def peer_limits(self) -> PeerLimits:
+        return PeerLimits(
+            hold=self.law.hold,
+            hold_damping_s=self.law.hold_damping_s,
+            range_m=self.peers.range_m,
+            stale_after_s=1.2 * self.trigger.t_max_s,
+            isolated_flight_s=self.peers.isolated_flight_s,
+            uncertainty_m=self.prediction_error_m,
+            digest_size=self.peers.digest,
+        )
+
+    @property
+    def safety_limits(self) -> SafetyLimits:
+        x = self.limits
+        return SafetyLimits(
+            x.speed_max_m_s, x.climb_max_m_s, x.descent_max_m_s, x.jerk_max_m_s3,
+            x.avoidance_acceleration_m_s2, x.barrier,
+        )  # fmt: skip
+
+    def slots(self, shape: str) -> Slots:
+        """Slots (forward, right, down) of a shape for the enabled vehicles; refused if they are too close."""
+        count = len(self.vehicles)
+        if shape == "custom":
+            if len(self.formation.custom_m) != count:
+                raise ConfigError(
+                    f"$.formation.custom_m must have one slot for each of the {count} enabled vehicles, "
+                    f"got {len(self.formation.custom_m)}"
+                )
+            slots = centred(self.formation.custom_m)
+        elif shape in SHAPES:
+            slots = shape_slots(shape, count, self.formation.spacing_m)
+        else:
+            raise ConfigError(f"$.formation.shape must be one of {', '.join((*SHAPES, 'custom'))}, got {shape!r}")
+        self._check_slots(shape, slots)
+        return slots
+
+    def _check_slots(self, shape: str, slots: Slots) -> None:
+        nearest = minimum_distance(slots)
+        if nearest < self.spacing_min_m:
+            raise ConfigError(
+                f"$.formation.spacing_m: {shape!r} needs at least {self.spacing_min_m:.2f} m "
+                f"(the larger of separation's range {self.r0_m:.2f} m and the safety radius {self.safety_radius_m:.2f} m, and "
+                f"{SPACING_MARGIN_M} m), got {nearest:.2f} m"
+            )
+        if minimum_distance(slots, DOWNWASH_RATIO) < self.safety_radius_m + SPACING_MARGIN_M and self.limits.barrier:
+            raise ConfigError(
+                f"$.formation.spacing_m: slots of {shape!r} lie above each other inside the downwash ellipsoid "
+                f"(vertical half-axis {DOWNWASH_RATIO * self.safety_radius_m:.2f} m, horizontal "
+                f"{self.safety_radius_m:.2f} m): choose a larger spacing or a level shape"
+            )
+
+    @cached_property
+    def pinned(self) -> dict[int, int]:
+        """Vehicle id -> slot, for the vehicles whose slot the file fixes."""
+        return {v.id: v.slot for v in self.vehicles if v.slot != "auto"}
+
+    @cached_property
+    def first_motion(self) -> Motion:
+        """Where everybody starts: each over its own pad at the formation's altitude, at rest."""
+        heading = radians(self.formation.heading_deg)
+        pads = [Ned(v.pad_north_m, v.pad_east_m, 0.0) for v in self.vehicles]
+        centre = [sum(p[k] for p in pads) / len(pads) for k in range(2)]
+        level = rotated(centred(pads), -heading)
+        return Motion(
+            revision=0,
+            start_ns=0,
+            issuer=0,
+            shape="pads",
+            slots={v.id: SlotChange(s, s) for v, s in zip(self.vehicles, level, strict=True)},
+            blend_start_ns=0,
+            blend_s=0.0,
+            legs_start_ns=0,
+            centre_ned_m=Ned(centre[0], centre[1], -self.formation.altitude_m),
+            velocity_ned_m_s=ZERO,
+            heading_rad=heading,
+            heading_rate_rad_s=0.0,
+            heading_follows_turns=self.plan.heading == "track",
+            legs=(),
+        )
+
+    def plan_legs(self, start: Ned) -> tuple[Leg, ...]:
+        """The plan's legs, begun at `start` (the centre, m)."""
+        return tuple(legs_from(self.plan.legs, start))
+
+    @cached_property
+    def shared_hash(self) -> str:
+        """Digest of what the vehicles must agree on: everything but links and the stubs' noise."""
+        shared = self.model_dump(exclude={"stub": True, "vehicle": {"__all__": {"mavlink", "zenoh"}}})
+        return blake2s(json.dumps(shared, sort_keys=True).encode(), digest_size=8).hexdigest()
+
+
+def legs_from(tables: Sequence[LegTable], start: Ned) -> Iterator[Leg]:
+    """Legs of the core from their tables; a waypoint's duration follows from its distance."""
+    place = start
+    for table in tables:
+        match table:
+            case HoldLegTable():
+                yield VelocityLeg(ZERO, table.duration_s)
+            case VelocityLegTable():
+                velocity = Ned(table.north_m_s, table.east_m_s, -table.up_m_s)
+                yield VelocityLeg(velocity, table.duration_s)
+                place = Ned(*(p + v * table.duration_s for p, v in zip(place, velocity, strict=True)))
+            case TurnLegTable():
+                angle = inf if table.angle_deg is None else radians(table.angle_deg)
+                yield TurnLeg(radians(table.rate_deg_s), angle)
+            case GotoLegTable():
+                down = place.down if table.altitude_m is None else -table.altitude_m
+                target = Ned(table.north_m, table.east_m, down)
+                way = sqrt(sum((a - b) ** 2 for a, b in zip(place, target, strict=True)))
+                yield GotoLeg(target, goto_duration_s(way, table.speed_m_s))
+                place = target
+
+
+def companion_port(instance: int) -> int:
+    """UDP port on which the companion of an instance listens: PX4's for the first ten, since 14550 is the GCS's."""
+    return 14540 + instance if instance < 10 else 24540 + instance
+
+
+def autopilot_port(instance: int) -> int:
+    """UDP port from which the autopilot of an instance sends."""
+    return 14580 + instance if instance < 10 else 25540 + instance
+
+
+def udp_endpoint(url: str) -> tuple[str, int] | None:
+    """Host and port of udp://HOST:PORT (an empty host is any), or None if it is another kind of link."""
+    try:
+        parts = urlsplit(url)
+        port = parts.port
+    except ValueError:
+        return None
+    if parts.scheme != "udp" or port is None or not 0 < port < 65536 or parts.path not in ("", "/"):
+        return None
+    return parts.hostname or "0.0.0.0", port
+
+
+def serial_endpoint(url: str) -> tuple[str, int] | None:
+    """Device and baud rate of serial:///dev/NAME:BAUD, or None if it is another kind of link."""
+    match = re.fullmatch(r"serial://(/[^:]+):(\d+)", url)
+    return (match[1], int(match[2])) if match else None
+
+
+def load(path: Path, change: Callable[[dict[str, Any]], None] | None = None) -> FleetConfig:
+    """Read and validate a fleet.toml; `change` may edit the raw tables first (command-line overrides).
+
+    Raises ConfigError naming file, place, what came and what is allowed; all faults of the file at once.
+    """
+    return parse(read_tables(path, change), path.name)
+
+
+def read_tables(path: Path, change: Callable[[dict[str, Any]], None] | None = None) -> dict[str, Any]:
+    """The raw tables of a TOML file, edited by `change`."""
+    try:
+        tables = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: is not valid TOML: {error}") from error
+    if change is not None:
+        change(tables)
+    return tables
+
+
+def parse(tables: Mapping[str, Any], name: str) -> FleetConfig:
+    """Validate raw tables; `name` is the file's, for messages."""
+    try:
+        config = FleetConfig.model_validate_json(json.dumps(tables, default=str))
+    except ValidationError as error:
+        raise ConfigError("\n".join(f"{name}: {_sentence(e)}" for e in error.errors())) from error
+    faults = list(_faults(config))
+    if not faults:
+        try:
+            config.slots(config.formation.shape)
+        except ConfigError as error:
+            faults.append(str(error))
+    if faults:
+        raise ConfigError("\n".join(f"{name}: {fault}" for fault in faults))
+    return config
+
+
+def _faults(config: FleetConfig) -> Iterator[str]:
+    """What single values cannot tell: references and duplicates across tables."""
+    if config.fleet.frame == "global" and config.fleet.origin is None:
+        yield '$.fleet.origin is required with frame = "global" (latitude_deg, longitude_deg, altitude_amsl_m)'
+    if not config.vehicles:
+        yield "$.vehicle: at least one vehicle must be enabled"
+    taken: dict[tuple[str, object], int] = {}
+    for k, v in enumerate(config.vehicle):
+        system_id = v.id if v.system_id is None else v.system_id
+        link = v.mavlink or f"udp://127.0.0.1:{companion_port(k)}"
+        udp, serial = udp_endpoint(link), serial_endpoint(link)
+        if udp is None and serial is None:
+            yield f"$.vehicle[{k}].mavlink must be udp://HOST:PORT or serial:///dev/NAME:BAUD, got {link!r}"
+        values: list[tuple[str, object]] = [("id", v.id), ("system_id", system_id)]
+        values.append(("mavlink", ("port", udp[1]) if udp else ("device", serial[0] if serial else link)))
+        if v.zenoh is not None:
+            values.append(("zenoh", v.zenoh))
+            if not re.fullmatch(r"(tcp|udp|tls|quic)/.+:\d+", v.zenoh):
+                yield f"$.vehicle[{k}].zenoh must be PROTOCOL/HOST:PORT with tcp, udp, tls or quic, got {v.zenoh!r}"
+        if v.slot != "auto":
+            values.append(("slot", v.slot))
+            if v.enabled and v.slot >= len(config.vehicles):
+                yield f"$.vehicle[{k}].slot must be below the {len(config.vehicles)} enabled vehicles, got {v.slot}"
+        for name, value in values:
+            if (name, value) in taken:
+                came = value[1] if isinstance(value, tuple) else value
+                yield f"$.vehicle[{k}].{name} must be unique, got {came!r} as in $.vehicle[{taken[name, value]}]"
+            else:
+                taken[name, value] = k
+    pads = [(v.pad_north_m, v.pad_east_m, 0.0) for v in config.vehicles]
+    if minimum_distance(pads) < config.safety_radius_m and config.limits.barrier:
+        yield (
+            f"$.launch.spacing_m / $.vehicle[].pad_m: pads must be at least the safety radius "
+            f"{config.safety_radius_m:.2f} m apart, got {minimum_distance(pads):.2f} m"
+        )
+    speed = config.limits.speed_max_m_s
+    for k, leg in enumerate(config.plan.legs):
+        if isinstance(leg, VelocityLegTable) and sqrt(leg.north_m_s**2 + leg.east_m_s**2) > 0.75 * speed:
+            yield f"$.plan.legs[{k}]: speed must be <= {0.75 * speed:g} m/s (3/4 of $.limits.speed_max_m_s)"
+        if isinstance(leg, TurnLegTable) and leg.rate_deg_s == 0:
+            yield f"$.plan.legs[{k}].rate_deg_s must not be 0 deg/s"
+        if isinstance(leg, TurnLegTable) and leg.angle_deg is None and k + 1 < len(config.plan.legs):
+            yield f"$.plan.legs[{k}].angle_deg is required except in the last leg"
+
+
+_UNITS = {
+    "_m_s3": "m/s^3", "_m_s2": "m/s^2", "_m_s": "m/s", "_deg_s": "deg/s", "_per_s": "1/s", "_s2": "s^2", "_deg": "deg",
+    "_m": "m", "_s": "s",
+}  # fmt: skip
+
+
+def _sentence(error: Any) -> str:
+    """One fault as a sentence: where, what is allowed, what came."""
+    kinds = {"hold", "velocity", "turn", "goto"}
+    loc = [p for k, p in enumerate(error["loc"]) if not (p in kinds and k >= 3 and error["loc"][0] == "plan")]
+    path = "$" + "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in loc)
+    came = error["input"]
+    match error["type"]:
+        case "extra_forbidden":
+            return f"{path} is not a known key; known here: {', '.join(_known(error['loc'][:-1]))}"
+        case "missing":
+            return f"{path} is required"
+        case "string_pattern_mismatch":
+            return f"{path} must match {error['ctx']['pattern']}, got {came!r}"
+        case "union_tag_invalid" | "union_tag_not_found":
+            return f"{path}.kind must be one of hold, velocity, turn, goto, got {came!r}"
+    unit = next((u for s, u in _UNITS.items() if str(loc[-1]).endswith(s)), "")
+    allowed = _allowed(error["loc"])
+    message = error["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
+    rule = f"must be {allowed} {unit}".rstrip() if allowed else f"must be {message}"
+    return f"{path} {rule}, got {came!r}"
+
+
+def _field(loc: tuple[Any, ...]) -> Any:
+    table: Any = FleetConfig
+    field: Any = None
+    for part in loc:
+        if isinstance(part, int) or part in ("hold", "velocity", "turn", "goto"):
+            continue
+        if not isinstance(table, type) or not issubclass(table, BaseModel) or part not in table.model_fields:
+            return None
+        field = table.model_fields[part]
+        table = _inner(field.annotation)
+    return field
+
+
+def _inner(annotation: Any) -> Any:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    for argument in getattr(annotation, "__args__", ()):
+        found = _inner(argument)
+        if found is not None:
+            return found
+    return None
+
+
+def _known(loc: tuple[Any, ...]) -> list[str]:
+    field = _field(loc)
+    table = FleetConfig if not loc else _inner(field.annotation) if field is not None else None
+    return sorted(table.model_fields) if table is not None else []
+
+
+def _allowed(loc: tuple[Any, ...]) -> str:
+    """The range of a numeric field, as 'a finite number > 0'."""
+    field = _field(loc)
+    if field is None:
+        return ""
+    items = [*field.metadata]
+    for argument in getattr(field.annotation, "__args__", ()):
+        items += getattr(argument, "__metadata__", ())
+    bounds = []
+    for item in [*items, *(m for i in items for m in getattr(i, "metadata", ()))]:
+        match item:
+            case annotated_types.Gt():
+                bounds.append(f"> {item.gt:g}")
+            case annotated_types.Ge():
+                bounds.append(f">= {item.ge:g}")
+            case annotated_types.Lt():
+                bounds.append(f"< {item.lt:g}")
+            case annotated_types.Le():
+                bounds.append(f"<= {item.le:g}")
+    if field.annotation is float or bounds:
+        kind = "a whole number" if field.annotation is int else "a finite number"
+        return " ".join([kind, " and ".join(dict.fromkeys(bounds))]).rstrip()
+    return ""

@@ -1,0 +1,26 @@
+"""Flight without a plan: agreement on the common velocity from what the vehicles publish.
+
+Each vehicle starts its estimate nu_i from its own velocity and then follows
+
+    nu_i' = -2 mean_j sat(nu_i - nu_j)            over the nu_j that were last published, saturated at 1 m/s
+
+Nothing is measured again afterwards, so sensor noise cannot random-walk it. nu_i stands for v_d in the law, and a
+sample is held with the nu under which it was sent: p_ref(t) - p_ref(t_k) = nu_k tau and v_d = nu_k (`hold.axis`).
+"""
+
+from math import sqrt
+
+RATE_PER_S = 2.0
+"""how fast the estimates of the common velocity approach each other"""
+
+
+def saturated(x: float, y: float, z: float, limit: float) -> tuple[float, float, float]:
+    """The vector with its norm clipped at `limit`."""
+    share = min(1.0, limit / max(sqrt(x * x + y * y + z * z), 1e-12))
+    return share * x, share * y, share * z
+
+
+def common_velocity_rate(n: float, sx: float, sy: float, sz: float) -> tuple[float, float, float]:
+    """nu_i' (m/s^2) from the sum of the saturated differences to n published estimates (m/s)."""
+    rate = -RATE_PER_S / max(n, 1.0)
+    return rate * sx, rate * sy, rate * sz

@@ -1,0 +1,286 @@
+"""The peer table: what this vehicle knows of the others, and what that says about now."""
+
+from collections import Counter
+from dataclasses import dataclass, field, replace
+from math import dist, isfinite
+from statistics import median
+
+from companion.core.frames import Ned
+from companion.core.hold import HoldKind, axis, weights
+from companion.core.plan import Moment, Programme, Reference
+from companion.core.values import FILTERED_PHASES, ZERO, Instant, Neighbour, PeerMessage, PeerSample, Phase
+
+FUTURE_LIMIT_S = 1.0
+"""a sample from further ahead than this comes from a clock that is wrong"""
+PRESENCE_DELAY_S = 1.5
+"""how long after a peer's end its presence may still be reported"""
+VERTICAL_DAMPING_S = 2.0
+GATE_VELOCITY_M_S = 0.7
+GATE_RESIDUAL_M = 2.0
+UNCERTAINTY_GROWTH_M_S = 0.3
+UNCERTAINTY_GROWTH_MAX_M = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class PeerLimits:
+    """What the table needs to know of the configuration."""
+
+    hold: HoldKind
+    hold_damping_s: float
+    range_m: float
+    stale_after_s: float
+    """a peer silent for longer is stale: beyond T_max with its jitter"""
+    isolated_flight_s: float
+    """how long a vehicle that hears nobody flies on before it holds by itself"""
+    uncertainty_m: float
+    """bound on the prediction's error of a peer that is heard"""
+    digest_size: int
+
+
+def held(
+    sample: PeerSample, reference_then: tuple[Ned, Ned], reference: Reference, fleet_ns: int, limits: PeerLimits
+) -> tuple[Ned, Ned]:
+    """Position and velocity at `fleet_ns` as a sample foretells them: what receivers use and senders compare with.
+
+    `reference_then` is p_ref and v_d of the sender's slot at the sample's time, `reference` the one at `fleet_ns`. A
+    vehicle in formation is held by the configured hold. One that climbs or lands stays over its spot, and its vertical
+    speed fades, since it ends at its altitude or on the ground; any other stands.
+    """
+    tau_s = max(0.0, (fleet_ns - sample.time_ns) * 1e-9)
+    p, v = sample.position_ned_m, sample.velocity_ned_m_s
+    if sample.phase in FILTERED_PHASES:
+        w = weights(limits.hold, tau_s, limits.hold_damping_s)
+        then_p, then_v = reference_then
+        now_p, now_v = reference.position_ned_m, reference.velocity_ned_m_s
+        x, vx = axis(p.north, v.north, then_p.north, then_v.north, now_p.north, now_v.north, w)
+        y, vy = axis(p.east, v.east, then_p.east, then_v.east, now_p.east, now_v.east, w)
+        z, vz = axis(p.down, v.down, then_p.down, then_v.down, now_p.down, now_v.down, w)
+        return Ned(x, y, z), Ned(vx, vy, vz)
+    if sample.phase in (Phase.ARMED, Phase.CLIMBING, Phase.LANDING):
+        w = weights("damped", tau_s, VERTICAL_DAMPING_S)
+        return Ned(p.north, p.east, p.down + w.position * v.down), Ned(0.0, 0.0, w.velocity * v.down)
+    return p, ZERO
+
+
+@dataclass(slots=True)
+class _Peer:
+    sample: PeerSample | None = None
+    reference_then: tuple[Ned, Ned] = (ZERO, ZERO)
+    boot_id: int | None = None
+    sequence: int = 0
+    present: bool = False
+    lost_at_ns: int | None = None
+    """fleet time at which presence ended or silence became too long"""
+    silent: bool = False
+    """it is lost by its silence, not by the end of its presence"""
+
+
+@dataclass(slots=True)
+class PeerTable:
+    """Peers by vehicle id. Nothing here raises for what a peer sends; it is refused, counted and named."""
+
+    own_id: int
+    ids: frozenset[int]
+    """every enabled vehicle's id but the own"""
+    limits: PeerLimits
+    programme: Programme
+    rejected: Counter[str] = field(default_factory=Counter)
+    _peers: dict[int, _Peer] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._peers = {i: _Peer() for i in sorted(self.ids)}
+
+    def accept(self, message: PeerMessage, now: Instant) -> str | None:
+        """Take a peer's message; returns why not if it was refused."""
+        sample = message.sample
+        reason = self._refusal(sample, now)
+        if reason is None:
+            peer = self._peers[sample.vehicle_id]
+            newer = (message.sequence - peer.sequence) % (1 << 32)
+            if peer.boot_id == message.boot_id and not 0 < newer < (1 << 31):
+                reason = "repeated or out of order"
+            else:
+                if peer.boot_id != message.boot_id or peer.lost_at_ns is None or sample.time_ns > peer.lost_at_ns:
+                    # One that was sent before the sender's end, and came late, brings nobody back.
+                    peer.present, peer.lost_at_ns, peer.silent = True, None, False
+                peer.boot_id, peer.sequence = message.boot_id, message.sequence
+                self._store(peer, sample)
+        if reason is not None:
+            self.rejected[reason] += 1
+            return reason
+        for hearsay in message.digest:
+            if hearsay.vehicle_id == self.own_id:
+                continue
+            reason = self._refusal(hearsay, now)
+            if reason is None:
+                self._store(self._peers[hearsay.vehicle_id], hearsay)
+            else:
+                self.rejected[f"digest: {reason}"] += 1
+        return None
+
+    def _refusal(self, sample: PeerSample, now: Instant) -> str | None:
+        if sample.vehicle_id == self.own_id:
+            return "own id"
+        if sample.vehicle_id not in self._peers:
+            return "foreign id"
+        if not all(isfinite(x) for x in (*sample.position_ned_m, *sample.velocity_ned_m_s)):
+            return "not finite"
+        if (sample.time_ns - now.fleet_ns) * 1e-9 > FUTURE_LIMIT_S:
+            return "from the future"
+        return None
+
+    def _store(self, peer: _Peer, sample: PeerSample) -> None:
+        if peer.sample is not None and sample.time_ns <= peer.sample.time_ns:
+            return
+        peer.sample = sample
+        if peer.lost_at_ns is not None and (peer.silent or sample.time_ns > peer.lost_at_ns):
+            # By digest: it is alive though it is not heard here.
+            peer.lost_at_ns, peer.silent = None, False
+        reference = self.programme.reference(sample.vehicle_id, sample.time_ns)
+        peer.reference_then = (reference.position_ned_m, reference.velocity_ned_m_s)
+
+    def plan_changed(self) -> None:
+        """Look the references of the samples up again, after a motion was adopted."""
+        for peer in self._peers.values():
+            if peer.sample is not None:
+                reference = self.programme.reference(peer.sample.vehicle_id, peer.sample.time_ns)
+                peer.reference_then = (reference.position_ned_m, reference.velocity_ned_m_s)
+
+    def presence(self, vehicle_id: int, alive: bool, now: Instant) -> None:
+        """Liveliness of a peer's process came or went."""
+        peer = self._peers.get(vehicle_id)
+        if peer is None:
+            if vehicle_id != self.own_id:
+                self.rejected["foreign id"] += 1
+            return
+        peer.present = alive
+        if alive:
+            peer.lost_at_ns, peer.silent = None, False
+        elif peer.lost_at_ns is None:
+            peer.lost_at_ns = now.fleet_ns
+
+    def sample(self, vehicle_id: int) -> PeerSample | None:
+        """The latest sample of a peer, its own or by digest."""
+        return self._peers[vehicle_id].sample
+
+    def boot_id(self, vehicle_id: int) -> int | None:
+        """The boot id a peer last gave."""
+        return self._peers[vehicle_id].boot_id
+
+    def phases(self) -> dict[int, Phase | None]:
+        """Each peer's phase as it last said, None for one that is lost or never was heard."""
+        return {
+            i: p.sample.phase if p.sample is not None and p.lost_at_ns is None and p.present else None
+            for i, p in self._peers.items()
+        }
+
+    def oldest_age_s(self, now: Instant) -> float | None:
+        """Age of the oldest sample among the peers that are there (s)."""
+        ages = [now.fleet_ns - p.sample.time_ns for p in self._peers.values() if p.sample is not None and p.present]
+        return max(ages) * 1e-9 if ages else None
+
+    def silent_for_s(self, now: Instant) -> float | None:
+        """How long nobody has been heard or present; None if nobody ever was (s)."""
+        if any(p.present for p in self._peers.values()):
+            return 0.0
+        ends = [p.lost_at_ns for p in self._peers.values() if p.lost_at_ns is not None]
+        return (now.fleet_ns - max(ends)) * 1e-9 if ends else None
+
+    def digest(self) -> tuple[PeerSample, ...]:
+        """The latest samples of peers for passing on, newest first."""
+        samples = [p.sample for p in self._peers.values() if p.sample is not None and p.lost_at_ns is None]
+        samples.sort(key=lambda s: (-s.time_ns, s.vehicle_id))
+        return tuple(samples[: self.limits.digest_size])
+
+    def predict(self, ego_ned_m: Ned, now: Instant, moment: Moment, gated: bool) -> list[Neighbour]:
+        """Every known peer within range, predicted to now under the plan at that `moment`, in the order of the ids.
+
+        With `gated` (only once formed), peers whose prediction is far from what the others' say drop from alignment
+        and cohesion; they still count for separation.
+        """
+        slots = self.programme.at(now.fleet_ns).slots
+        own = moment.slot(slots[self.own_id]).position_ned_m
+        neighbours = []
+        for i, peer in self._peers.items():
+            if peer.sample is not None:
+                n = self._predict(peer, peer.sample, now, moment.slot(slots[i]), own)
+                if self._in_range(n, ego_ned_m):
+                    neighbours.append(n)
+        return _gate(neighbours, ego_ned_m) if gated else neighbours
+
+    def _in_range(self, n: Neighbour, ego_ned_m: Ned) -> bool:
+        limit, other = self.limits.range_m, n.other_end_ned_m
+        return dist(n.position_ned_m, ego_ned_m) <= limit or (other is not None and dist(other, ego_ned_m) <= limit)
+
+    def _predict(self, peer: _Peer, sample: PeerSample, now: Instant, reference: Reference, own: Ned) -> Neighbour:
+        limits = self.limits
+        flying = sample.phase in FILTERED_PHASES
+        tau_s = max(0.0, (now.fleet_ns - sample.time_ns) * 1e-9)
+        if tau_s > limits.stale_after_s and peer.lost_at_ns is None and flying:
+            peer.lost_at_ns, peer.silent = sample.time_ns + round(limits.stale_after_s * 1e9), True
+        position, velocity = held(sample, peer.reference_then, reference, now.fleet_ns, limits)
+        uncertainty = limits.uncertainty_m
+        other_end: Ned | None = None
+        lost = peer.lost_at_ns is not None
+        if flying and peer.lost_at_ns is not None:
+            since_s = (now.fleet_ns - peer.lost_at_ns) * 1e-9
+            uncertainty += min(UNCERTAINTY_GROWTH_M_S * max(since_s, 0.0), UNCERTAINTY_GROWTH_MAX_M)
+            position, velocity, other_end = self._both_ends(peer, sample, peer.lost_at_ns, now)
+        slot = reference.position_ned_m
+        return Neighbour(
+            vehicle_id=sample.vehicle_id,
+            position_ned_m=position,
+            velocity_ned_m_s=velocity,
+            offset_ned_m=Ned(own.north - slot.north, own.east - slot.east, own.down - slot.down),
+            age_s=tau_s,
+            in_formation=flying and not lost,
+            shares_avoidance=flying and not lost,
+            uncertainty_m=uncertainty,
+            other_end_ned_m=other_end,
+            reference_velocity_ned_m_s=reference.velocity_ned_m_s,
+            reference_acceleration_ned_m_s2=reference.acceleration_ned_m_s2,
+        )
+
+    def _both_ends(self, peer: _Peer, sample: PeerSample, lost_at_ns: int, now: Instant) -> tuple[Ned, Ned, Ned]:
+        """Where a lost peer is if it flew on, how fast, and where if it stopped.
+
+        One whose presence ended was seen alive until shortly before, so it stopped no earlier than PRESENCE_DELAY_S
+        before that; one that fell silent may have stopped at any time since its last sample. A vehicle that hears
+        nobody holds by itself after `isolated_flight_s`, so it flew on no longer than that.
+        """
+
+        def at(fleet_ns: int) -> tuple[Ned, Ned]:
+            reference = self.programme.reference(sample.vehicle_id, fleet_ns)
+            return held(sample, peer.reference_then, reference, fleet_ns, self.limits)
+
+        seen_ns = sample.time_ns if peer.silent else lost_at_ns - round(PRESENCE_DELAY_S * 1e9)
+        stopped, _ = at(max(sample.time_ns, seen_ns))
+        latest_ns = lost_at_ns + round(self.limits.isolated_flight_s * 1e9)
+        flown, velocity = at(min(now.fleet_ns, latest_ns))
+        return flown, velocity if now.fleet_ns < latest_ns else ZERO, stopped
+
+
+def is_outlier(velocity_north: float, velocity_east: float, residual_north: float, residual_east: float) -> bool:
+    """The gates of a formed peer: its velocity against its slot's (m/s), its residual against the median's (m)."""
+    return (
+        velocity_north * velocity_north + velocity_east * velocity_east > GATE_VELOCITY_M_S * GATE_VELOCITY_M_S
+        or residual_north * residual_north + residual_east * residual_east > GATE_RESIDUAL_M * GATE_RESIDUAL_M
+    )
+
+
+def _gate(neighbours: list[Neighbour], ego: Ned) -> list[Neighbour]:
+    north, east = [], []
+    for n in neighbours:
+        if n.in_formation:
+            north.append(ego.north - n.position_ned_m.north - n.offset_ned_m.north)
+            east.append(ego.east - n.position_ned_m.east - n.offset_ned_m.east)
+    if not north:
+        return neighbours
+    middle_north, middle_east = median(north), median(east)
+    gated = list(neighbours)
+    taking_part = (k for k, n in enumerate(neighbours) if n.in_formation)
+    for k, r_north, r_east in zip(taking_part, north, east, strict=True):
+        v, slot = neighbours[k].velocity_ned_m_s, neighbours[k].reference_velocity_ned_m_s
+        if is_outlier(v.north - slot.north, v.east - slot.east, r_north - middle_north, r_east - middle_east):
+            gated[k] = replace(neighbours[k], in_formation=False)
+    return gated

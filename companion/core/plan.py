@@ -1,0 +1,486 @@
+"""The plan: the formation's reference motion p_ref, v_d, a_d, as a function of fleet time alone.
+
+A `Motion` says everything that the vehicles must agree on: where the centre starts, how it goes on (legs), and how the
+slots pass from one formation to the next. It is complete in itself, so a late joiner needs only the newest one, and a
+new one starts exactly where the one before has taken the formation. Motions are ordered by (revision, start, issuer);
+the largest wins, which is how vehicles without a leader agree on one of several proposals.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from math import atan2, cos, dist, hypot, inf, pi, sin, sqrt
+from typing import Literal, NamedTuple
+
+from companion.core.formation import Slots, assign
+from companion.core.frames import Ned
+from companion.core.values import ZERO
+
+PLAN_ACCELERATION_M_S2 = 0.5
+"""the largest acceleration with which a leg changes the centre's velocity"""
+TURN_RAMP_S = 3.0
+"""time in which a turn's rate is built up and taken back"""
+BLEND_MIN_S = 8.0
+"""shortest time in which slots move from one formation to the next"""
+
+# Gauss-Legendre nodes and weights on [0, 1], order 8: exact to 1e-15 for the arcs of a turn's ramp.
+_NODES = (
+    (0.01985507175123188, 0.05061426814518813),
+    (0.10166676129318664, 0.1111905172266872),
+    (0.2372337950418355, 0.1568533229389437),
+    (0.4082826787521751, 0.181341891689181),
+    (0.5917173212478249, 0.181341891689181),
+    (0.7627662049581645, 0.1568533229389437),
+    (0.8983332387068134, 0.1111905172266872),
+    (0.9801449282487681, 0.05061426814518813),
+)
+
+
+class Reference(NamedTuple):
+    """Position (m), velocity (m/s), acceleration (m/s^2) in the fleet frame, and heading (rad)."""
+
+    position_ned_m: Ned
+    velocity_ned_m_s: Ned
+    acceleration_ned_m_s2: Ned
+    heading_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class VelocityLeg:
+    """Change the centre's velocity smoothly to `velocity_ned_m_s` and keep it; zero velocity holds."""
+
+    velocity_ned_m_s: Ned
+    duration_s: float
+    """length of the leg, the change included; it lasts at least as long as the change"""
+    kind: Literal["velocity"] = "velocity"
+
+
+@dataclass(frozen=True, slots=True)
+class TurnLeg:
+    """Turn the horizontal velocity at `rate_rad_s` (positive clockwise) through `angle_rad`, its speed unchanged."""
+
+    rate_rad_s: float
+    angle_rad: float
+    """how far, positive; infinite circles for ever"""
+    kind: Literal["turn"] = "turn"
+
+
+@dataclass(frozen=True, slots=True)
+class GotoLeg:
+    """Fly the centre to a point and come to rest there: a quintic polynomial of time."""
+
+    target_ned_m: Ned
+    duration_s: float
+    kind: Literal["goto"] = "goto"
+
+
+Leg = VelocityLeg | TurnLeg | GotoLeg
+
+
+def goto_duration_s(distance_m: float, speed_m_s: float) -> float:
+    """Time for a rest-to-rest leg that keeps below a speed and twice PLAN_ACCELERATION_M_S2 (minimum jerk: peaks of
+    15/8 of the mean speed, 5.77 d/T^2)."""
+    return max(1.875 * distance_m / speed_m_s, sqrt(5.7735 * distance_m / (2 * PLAN_ACCELERATION_M_S2)), 1.0)
+
+
+def blend_duration_s(distance_m: float, speed_m_s: float) -> float:
+    """Time in which slots move `distance_m` at most: minimum jerk, below `speed_m_s` and 1 m/s^2, and 8 s at least."""
+    return max(BLEND_MIN_S, 1.875 * distance_m / speed_m_s, sqrt(5.7735 * distance_m))
+
+
+class _Centre(NamedTuple):
+    position: Ned
+    velocity: Ned
+    acceleration: Ned
+    turned: float
+    turned_rate: float
+    turned_acceleration: float
+
+
+def _velocity_leg(leg: VelocityLeg, p0: Ned, v0: Ned, t: float) -> _Centre:
+    dv = Ned(*(b - a for a, b in zip(v0, leg.velocity_ned_m_s, strict=True)))
+    ramp = _ramp_s(dv)
+    x = min(t / ramp, 1.0) if ramp > 0.0 else 1.0
+    level = x * x * (3.0 - 2.0 * x)
+    area = ramp * (x * x * x - 0.5 * x**4) + (t - ramp * x)
+    slope = 6.0 * x * (1.0 - x) / ramp if ramp > 0.0 else 0.0
+    return _Centre(
+        Ned(*(p + v * t + d * area for p, v, d in zip(p0, v0, dv, strict=True))),
+        Ned(*(v + d * level for v, d in zip(v0, dv, strict=True))),
+        Ned(*(d * slope for d in dv)),
+        0.0, 0.0, 0.0,
+    )  # fmt: skip
+
+
+def _ramp_s(dv: Ned) -> float:
+    return 1.5 * sqrt(sum(d * d for d in dv)) / PLAN_ACCELERATION_M_S2
+
+
+def _turn_profile(leg: TurnLeg, t: float) -> tuple[float, float, float]:
+    """Angle turned (rad), its rate and its acceleration at t; the rate rises and falls as a smoothstep."""
+    rate = leg.rate_rad_s
+    ramp, whole = _turn_times(leg)
+
+    def rising(s: float) -> tuple[float, float, float]:
+        x = min(s / ramp, 1.0)
+        level = x * x * (3.0 - 2.0 * x)
+        angle = rate * (ramp * (x * x * x - 0.5 * x**4) + (s - ramp * x))
+        return angle, rate * level, rate * 6.0 * x * (1.0 - x) / ramp
+
+    if t <= whole - ramp:
+        return rising(t)
+    total = leg.angle_rad * (1.0 if rate > 0.0 else -1.0)
+    angle, now, change = rising(max(whole - t, 0.0))
+    return total - angle, now, -change
+
+
+def _turn_times(leg: TurnLeg) -> tuple[float, float]:
+    """Ramp and whole duration (s): the rate's area under ramps and plateau is the angle."""
+    rate = abs(leg.rate_rad_s)
+    ramp = min(TURN_RAMP_S, leg.angle_rad / rate)
+    return ramp, leg.angle_rad / rate + ramp
+
+
+@lru_cache(maxsize=16)
+def _arc(leg: TurnLeg, v0: Ned, start: float, end: float) -> tuple[float, float]:
+    """Integral of the turning velocity over [start, end] of the leg (m); the whole rising ramp's is asked for at every
+    tick of the turn."""
+    north = east = 0.0
+    for node, weight in _NODES:
+        angle, _, _ = _turn_profile(leg, start + node * (end - start))
+        c, s = cos(angle), sin(angle)
+        north += weight * (c * v0.north - s * v0.east)
+        east += weight * (s * v0.north + c * v0.east)
+    return north * (end - start), east * (end - start)
+
+
+def _turn_leg(leg: TurnLeg, p0: Ned, v0: Ned, t: float) -> _Centre:
+    ramp, whole = _turn_times(leg)
+    angle, rate, change = _turn_profile(leg, t)
+    north, east = _arc(leg, v0, 0.0, min(t, ramp))
+    if t > ramp:
+        # Constant rate in closed form, up to the falling ramp.
+        until = min(t, whole - ramp)
+        a0, a1 = _turn_profile(leg, ramp)[0], _turn_profile(leg, until)[0]
+        s, c = (sin(a1) - sin(a0)) / leg.rate_rad_s, (cos(a1) - cos(a0)) / leg.rate_rad_s
+        north += s * v0.north + c * v0.east
+        east += s * v0.east - c * v0.north
+        if t > until:
+            n, e = _arc(leg, v0, until, t)
+            north, east = north + n, east + e
+    c, s = cos(angle), sin(angle)
+    velocity = Ned(c * v0.north - s * v0.east, s * v0.north + c * v0.east, v0.down)
+    return _Centre(
+        Ned(p0.north + north, p0.east + east, p0.down + v0.down * t),
+        velocity,
+        Ned(-rate * velocity.east, rate * velocity.north, 0.0),
+        angle, rate, change,
+    )  # fmt: skip
+
+
+def _goto_leg(leg: GotoLeg, p0: Ned, v0: Ned, t: float) -> _Centre:
+    whole = leg.duration_s
+    x = min(t / whole, 1.0)
+    m, m1, m2 = minimum_jerk(x)
+    # The start's velocity fades by the quintic with value 0, slope 1 at 0 and rest at 1.
+    f = x - 6 * x**3 + 8 * x**4 - 3 * x**5
+    f1 = 1 - 18 * x**2 + 32 * x**3 - 15 * x**4
+    f2 = -36 * x + 96 * x**2 - 60 * x**3
+    way = Ned(*(b - a for a, b in zip(p0, leg.target_ned_m, strict=True)))
+    return _Centre(
+        Ned(*(p + d * m + v * whole * f for p, d, v in zip(p0, way, v0, strict=True))),
+        Ned(*(d * m1 / whole + v * f1 for d, v in zip(way, v0, strict=True))),
+        Ned(*(d * m2 / whole**2 + v * f2 / whole for d, v in zip(way, v0, strict=True))),
+        0.0, 0.0, 0.0,
+    )  # fmt: skip
+
+
+def minimum_jerk(x: float) -> tuple[float, float, float]:
+    """Value, slope and curvature over x in [0, 1] of the rest-to-rest polynomial 10x^3 - 15x^4 + 6x^5."""
+    x = min(max(x, 0.0), 1.0)
+    return (
+        x * x * x * (10.0 - 15.0 * x + 6.0 * x * x),
+        30.0 * x * x * (1.0 - x) ** 2,
+        60.0 * x * (1.0 - x) * (1.0 - 2.0 * x),
+    )
+
+
+def leg_duration_s(leg: Leg, v0: Ned) -> float:
+    """How long the leg lasts from the velocity v0 (m/s)."""
+    match leg:
+        case VelocityLeg():
+            return max(leg.duration_s, _ramp_s(Ned(*(b - a for a, b in zip(v0, leg.velocity_ned_m_s, strict=True)))))
+        case TurnLeg():
+            return _turn_times(leg)[1]
+        case GotoLeg():
+            return leg.duration_s
+
+
+def _along(leg: Leg, p0: Ned, v0: Ned, t: float) -> _Centre:
+    match leg:
+        case VelocityLeg():
+            return _velocity_leg(leg, p0, v0, t)
+        case TurnLeg():
+            return _turn_leg(leg, p0, v0, t)
+        case GotoLeg():
+            return _goto_leg(leg, p0, v0, t)
+
+
+class SlotChange(NamedTuple):
+    """One vehicle's slot before and after the blend: offsets (forward, right, down) from the centre, m."""
+
+    before: Ned
+    after: Ned
+
+
+class Moment(NamedTuple):
+    """A motion at one time: what all its slots have in common, so that each slot costs little."""
+
+    centre: _Centre
+    heading_rad: float
+    cosine: float
+    sine: float
+    rate: float
+    rate_change: float
+    blend: tuple[float, float, float]
+    """part of the way from the slots before to those after, its rate (1/s) and the rate's change (1/s^2)"""
+
+    def slot(self, change: SlotChange) -> Reference:
+        """p_ref,i = c + R(psi) D_i and its derivatives."""
+        (p, v, a, _, _, _), heading, c, s, rate, bend, (m, m1, m2) = self
+        (f0, r0, d0), (f1, r1, d1) = change
+        df, dr, dd = f1 - f0, r1 - r0, d1 - d0
+        forward, right = f0 + m * df, r0 + m * dr
+        dn, de = c * forward - s * right, s * forward + c * right
+        wn, we = c * df - s * dr, s * df + c * dr
+        return Reference(
+            Ned(p.north + dn, p.east + de, p.down + d0 + m * dd),
+            Ned(v.north - rate * de + m1 * wn, v.east + rate * dn + m1 * we, v.down + m1 * dd),
+            Ned(
+                a.north - bend * de - rate * rate * dn - 2 * rate * m1 * we + m2 * wn,
+                a.east + bend * dn - rate * rate * de + 2 * rate * m1 * wn + m2 * we,
+                a.down + m2 * dd,
+            ),
+            heading,
+        )
+
+
+@dataclass(frozen=True)
+class Motion:
+    """The fleet's motion from `start_ns` on: immutable, the same bytes on every vehicle."""
+
+    revision: int
+    start_ns: int
+    """fleet time from which it replaces the motion before it (ns)"""
+    issuer: int
+    """vehicle that proposed it, or 0 for the operator or the configuration"""
+    shape: str
+    """name of the formation that the slots end in"""
+    slots: dict[int, SlotChange]
+    """vehicle id -> its slots"""
+    blend_start_ns: int
+    """fleet time at which the slots begin to pass from before to after (ns)"""
+    blend_s: float
+    """how long they take; 0: they are there"""
+    legs_start_ns: int
+    """fleet time at which the first leg begins (ns); a change of formation leaves the legs as they are"""
+    centre_ned_m: Ned
+    """the centre at the start of the legs"""
+    velocity_ned_m_s: Ned
+    heading_rad: float
+    """clockwise from north, at the start of the legs"""
+    heading_rate_rad_s: float
+    """left over from a turn that these legs interrupt; it dies out within TURN_RAMP_S"""
+    heading_follows_turns: bool
+    legs: tuple[Leg, ...]
+    then: Literal["stay", "land"] = "stay"
+    """what the vehicles do when the last leg has ended"""
+
+    @property
+    def order(self) -> tuple[int, int, int]:
+        """Larger wins."""
+        return (self.revision, self.start_ns, self.issuer)
+
+    @cached_property
+    def _starts(self) -> tuple[tuple[float, Ned, Ned, float], ...]:
+        """For each leg and the state after the last: (time since start, position, velocity, angle turned)."""
+        rows = [(0.0, self.centre_ned_m, self.velocity_ned_m_s, 0.0)]
+        for leg in self.legs:
+            t, p, v, turned = rows[-1]
+            duration = leg_duration_s(leg, v)
+            if duration == inf:
+                rows.append((inf, p, v, turned))
+                break
+            end = _along(leg, p, v, duration)
+            rows.append((t + duration, end.position, end.velocity, turned + end.turned))
+        return tuple(rows)
+
+    @property
+    def end_ns(self) -> int | None:
+        """Fleet time at which the last leg and the blend are over; None for a motion without end."""
+        last = self._starts[-1][0]
+        if last == inf:
+            return None
+        return max(self.legs_start_ns + round(last * 1e9), self.blend_end_ns)
+
+    @property
+    def blend_end_ns(self) -> int:
+        """Fleet time at which the slots are those of the new formation."""
+        return self.blend_start_ns + round(self.blend_s * 1e9)
+
+    def moment(self, fleet_ns: int) -> Moment:
+        """The centre, the heading and the blend at a time; before the legs' start the centre's velocity is constant."""
+        t = (fleet_ns - self.legs_start_ns) * 1e-9
+        starts = self._starts
+        k = 0
+        while k + 1 < len(starts) and t >= starts[k + 1][0]:
+            k += 1
+        since, p, v, turned = starts[k]
+        if t < 0.0 or k >= len(self.legs):
+            dt = t - since
+            now = _Centre(
+                Ned(p.north + v.north * dt, p.east + v.east * dt, p.down + v.down * dt), v, ZERO, 0.0, 0.0, 0.0
+            )
+        else:
+            now = _along(self.legs[k], p, v, t - since)
+        follow = 1.0 if self.heading_follows_turns else 0.0
+        left, left_rate, left_change = self._left_over_turn(t)
+        heading = self.heading_rad + follow * (turned + now.turned) + left
+        return Moment(
+            now,
+            _wrapped(heading),
+            cos(heading),
+            sin(heading),
+            follow * now.turned_rate + left_rate,
+            follow * now.turned_acceleration + left_change,
+            self._blend(fleet_ns),
+        )
+
+    def _left_over_turn(self, t: float) -> tuple[float, float, float]:
+        rate = self.heading_rate_rad_s
+        if rate == 0.0:
+            return 0.0, 0.0, 0.0
+        x = min(max(t / TURN_RAMP_S, 0.0), 1.0)
+        return (
+            rate * TURN_RAMP_S * (x - x**3 + 0.5 * x**4),
+            rate * (1.0 - 3.0 * x * x + 2.0 * x**3),
+            rate * 6.0 * x * (x - 1.0) / TURN_RAMP_S,
+        )
+
+    def _blend(self, fleet_ns: int) -> tuple[float, float, float]:
+        x = (fleet_ns - self.blend_start_ns) * 1e-9 / self.blend_s if self.blend_s > 0.0 else 1.0
+        if not 0.0 < x < 1.0:
+            return (0.0 if x <= 0.0 else 1.0), 0.0, 0.0
+        m, m1, m2 = minimum_jerk(x)
+        return m, m1 / self.blend_s, m2 / self.blend_s**2
+
+    def reference(self, vehicle_id: int, fleet_ns: int) -> Reference:
+        """p_ref,i, v_d,i and a_d,i of one vehicle's slot at a time."""
+        return self.moment(fleet_ns).slot(self.slots[vehicle_id])
+
+
+def _wrapped(angle: float) -> float:
+    return atan2(sin(angle), cos(angle))
+
+
+def with_legs(
+    motion: Motion,
+    *,
+    at_ns: int,
+    issuer: int,
+    legs: tuple[Leg, ...],
+    then: Literal["stay", "land"] = "stay",
+    heading_follows_turns: bool | None = None,
+) -> Motion:
+    """The motion that takes over from `motion` at `at_ns` with other legs; the slots go on as they were."""
+    now = motion.moment(at_ns)
+    return replace(
+        motion,
+        revision=motion.revision + 1,
+        start_ns=at_ns,
+        issuer=issuer,
+        legs_start_ns=at_ns,
+        centre_ned_m=now.centre.position,
+        velocity_ned_m_s=now.centre.velocity,
+        heading_rad=now.heading_rad,
+        heading_rate_rad_s=now.rate,
+        heading_follows_turns=motion.heading_follows_turns if heading_follows_turns is None else heading_follows_turns,
+        legs=legs,
+        then=then,
+    )
+
+
+def with_formation(
+    motion: Motion, *, at_ns: int, issuer: int, shape: str, slots: Slots, pinned: Mapping[int, int], speed_m_s: float
+) -> Motion:
+    """The motion that takes over from `motion` at `at_ns` with its vehicles moving to other slots.
+
+    Each vehicle's next slot is assigned from the slots it is in at `at_ns`, both nominal (`formation.assign`);
+    `pinned` names the slots of vehicles that always take the same. The legs go on as they were.
+    """
+    m = motion.moment(at_ns).blend[0]
+    ids = sorted(motion.slots)
+    before = [Ned(*(a + m * (b - a) for a, b in zip(*motion.slots[i], strict=True))) for i in ids]
+    order = assign(before, slots, _rows(ids, pinned))
+    after = [slots[k] for k in order]
+    way = max((dist(a, b) for a, b in zip(before, after, strict=True)), default=0.0)
+    return replace(
+        motion,
+        revision=motion.revision + 1,
+        start_ns=at_ns,
+        issuer=issuer,
+        shape=shape,
+        slots={i: SlotChange(a, b) for i, a, b in zip(ids, before, after, strict=True)},
+        blend_start_ns=at_ns,
+        blend_s=blend_duration_s(way, speed_m_s),
+    )
+
+
+def assignment_matches(motion: Motion, slots: Slots, pinned: Mapping[int, int]) -> bool:
+    """Whether a received motion's slots are what this vehicle assigns from its own configuration; else refused."""
+    ids = sorted(motion.slots)
+    order = assign([motion.slots[i].before for i in ids], slots, _rows(ids, pinned))
+    return len(slots) == len(ids) and all(
+        dist(motion.slots[i].after, slots[k]) < 1e-3 for i, k in zip(ids, order, strict=True)
+    )
+
+
+def _rows(ids: Sequence[int], pinned: Mapping[int, int]) -> dict[int, int]:
+    return {row: pinned[i] for row, i in enumerate(ids) if i in pinned}
+
+
+def course_rad(velocity_ned_m_s: Ned) -> float | None:
+    """Course over ground (rad, clockwise from north); None below 5 cm/s."""
+    north, east, _ = velocity_ned_m_s
+    return atan2(east, north) % (2 * pi) if hypot(north, east) > 0.05 else None
+
+
+@dataclass(slots=True)
+class Programme:
+    """The motions a vehicle knows: the newest, and those before it, for samples made under them."""
+
+    motions: list[Motion]
+
+    @property
+    def newest(self) -> Motion:
+        """The motion that wins so far; it may start in the future."""
+        return self.motions[-1]
+
+    def adopt(self, motion: Motion) -> bool:
+        """Take a motion if it is larger than the newest; one that replaces another of its revision replaces it."""
+        if motion.order <= self.newest.order:
+            return False
+        kept = [m for m in self.motions if m.revision < motion.revision]
+        self.motions = [*kept[-3:], motion]
+        return True
+
+    def at(self, fleet_ns: int) -> Motion:
+        """The motion in force at a time: the newest that has started."""
+        for motion in reversed(self.motions):
+            if fleet_ns >= motion.start_ns:
+                return motion
+        return self.motions[0]
+
+    def reference(self, vehicle_id: int, fleet_ns: int) -> Reference:
+        """A vehicle's reference at a time under the motion then in force."""
+        return self.at(fleet_ns).reference(vehicle_id, fleet_ns)

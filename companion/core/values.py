@@ -1,0 +1,127 @@
+"""Values that pass between the parts of the core: immutable, SI units, fleet frame (NED) unless named otherwise."""
+
+from dataclasses import dataclass
+from enum import IntEnum, unique
+from typing import NamedTuple
+
+from companion.core.frames import Ned
+
+ZERO = Ned(0.0, 0.0, 0.0)
+
+
+class Instant(NamedTuple):
+    """One moment on two clocks."""
+
+    monotonic_ns: int
+    """this machine's monotonic clock (ns); never compared with another machine's"""
+    fleet_ns: int
+    """fleet time: UTC since 1970 (ns), latched to the monotonic clock and slewed, never stepped"""
+
+
+@unique
+class Phase(IntEnum):
+    """Where a vehicle is in its flight; `core.phase` holds every transition."""
+
+    IDLE = 0
+    ARMED = 1
+    CLIMBING = 2
+    FORMING = 3
+    FORMED = 4
+    LANDING = 5
+    LANDED = 6
+    RELEASED = 7
+    """the pilot or the autopilot's own failsafe has the vehicle; we send nothing"""
+
+
+FILTERED_PHASES = frozenset({Phase.FORMING, Phase.FORMED})
+"""phases in which a vehicle's own safety filter steers it, so that a pair shares the avoidance"""
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleState:
+    """A vehicle's own state as its estimator tells it."""
+
+    time_ns: int
+    """fleet time at which the state held (ns)"""
+    position_ned_m: Ned
+    velocity_ned_m_s: Ned
+
+
+@dataclass(frozen=True, slots=True)
+class PeerSample:
+    """One published state of a vehicle: its own, or another's passed on in a digest."""
+
+    vehicle_id: int
+    time_ns: int
+    """the sample's own time (fleet time, ns)"""
+    position_ned_m: Ned
+    velocity_ned_m_s: Ned
+    revision: int
+    """revision of the motion under which the sample was made"""
+    phase: Phase
+
+
+@dataclass(frozen=True, slots=True)
+class PeerMessage:
+    """Everything one state message says."""
+
+    boot_id: int
+    """drawn anew at each start of the sender's process"""
+    sequence: int
+    """counts the sender's messages modulo 2**32"""
+    motion_start_ns: int
+    """start of the motion that the sender holds as newest (fleet time, ns)"""
+    motion_issuer: int
+    sample: PeerSample
+    digest: tuple[PeerSample, ...]
+    """the sender's latest samples of others, newest first"""
+
+
+@dataclass(frozen=True, slots=True)
+class Neighbour:
+    """A peer predicted to the present."""
+
+    vehicle_id: int
+    position_ned_m: Ned
+    velocity_ned_m_s: Ned
+    offset_ned_m: Ned
+    """desired p_i - p_j (m)"""
+    age_s: float
+    """age of the sample behind the prediction"""
+    in_formation: bool
+    """takes part in alignment and cohesion; a gated, stale, landed or lost peer does not"""
+    shares_avoidance: bool
+    """its own safety filter is active, so that each of the pair takes half"""
+    uncertainty_m: float
+    """how far from the prediction it may be"""
+    other_end_ned_m: Ned | None = None
+    """where a lost peer may stand instead; it is anywhere between the two"""
+    reference_velocity_ned_m_s: Ned = ZERO
+    """what the plan asks of its slot: differs from the own slot's while slots turn or move"""
+    reference_acceleration_ned_m_s2: Ned = ZERO
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """What the law asks for, before the safety filter."""
+
+    acceleration_ned_m_s2: Ned
+    reference_position_ned_m: Ned
+    """p_ref,i of the vehicle's slot"""
+    reference_velocity_ned_m_s: Ned
+    reference_acceleration_ned_m_s2: Ned
+    yaw_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class SafeSetpoint:
+    """What may be sent to an autopilot. Only `core.safety` makes one."""
+
+    velocity_north_m_s: float
+    velocity_east_m_s: float
+    velocity_down_m_s: float
+    acceleration_north_m_s2: float
+    acceleration_east_m_s2: float
+    position_down_m: float
+    """altitude, as fleet-frame down"""
+    yaw_rad: float

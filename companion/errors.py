@@ -1,0 +1,17 @@
+"""Errors that a user can act on. Misbehaviour of peers and autopilots is counted, not raised."""
+
+
+class CompanionError(Exception):
+    """Base of every error that ends a command with a sentence instead of a traceback."""
+
+
+class ConfigError(CompanionError):
+    """A value in fleet.toml or on the command line is refused; says where, what came and what is allowed."""
+
+
+class WireError(CompanionError):
+    """Bytes that are not what they claim to be."""
+
+
+class RefusedError(CompanionError):
+    """A command was understood and refused, by whom and why."""

@@ -1,0 +1,286 @@
+"""MAVLink 2 datagrams <-> values, for one vehicle's link. No I/O; what cannot be read is counted.
+
+The companion speaks with the vehicle's own system id and component 191 (onboard computer). Values stay in the
+autopilot's local NED frame here; `agent` shifts them to the fleet frame.
+"""
+
+import os
+import struct
+from collections import Counter
+from dataclasses import dataclass
+from enum import IntEnum
+from math import inf, isfinite, nan
+from typing import Any
+
+os.environ.setdefault("MAVLINK20", "1")
+from pymavlink.dialects.v20 import development as mavlink
+
+from companion.core.frames import Geodetic, Ned
+
+COMPANION_COMPONENT_ID = 191
+AUTOPILOT_COMPONENT_ID = 1
+AUTOPILOT_PX4 = 12
+SETPOINT_TYPE_MASK = 0x903
+"""ignore x, y, az and yaw rate: velocity and acceleration on the level, altitude by position, climb rate, yaw"""
+
+
+class Px4Mode(IntEnum):
+    """PX4's main modes and AUTO sub-modes as custom_mode (main << 16 | sub << 24)."""
+
+    MANUAL = 1 << 16
+    ALTCTL = 2 << 16
+    POSCTL = 3 << 16
+    AUTO_READY = 4 << 16 | 1 << 24
+    AUTO_TAKEOFF = 4 << 16 | 2 << 24
+    AUTO_LOITER = 4 << 16 | 3 << 24
+    AUTO_MISSION = 4 << 16 | 4 << 24
+    AUTO_RTL = 4 << 16 | 5 << 24
+    AUTO_LAND = 4 << 16 | 6 << 24
+    ACRO = 5 << 16
+    OFFBOARD = 6 << 16
+    STABILIZED = 7 << 16
+    TERMINATION = 10 << 16
+
+
+def mode_name(custom_mode: int) -> str:
+    """The mode's name, or its number."""
+    try:
+        return Px4Mode(custom_mode).name
+    except ValueError:
+        return f"{custom_mode:#x}"
+
+
+@dataclass(frozen=True, slots=True)
+class Heartbeat:
+    """HEARTBEAT (0) of the autopilot."""
+
+    autopilot: int
+    vehicle_type: int
+    armed: bool
+    custom_mode: int
+    system_status: int
+
+
+@dataclass(frozen=True, slots=True)
+class LocalPosition:
+    """LOCAL_POSITION_NED (32)."""
+
+    boot_ms: int
+    position_local_ned_m: Ned
+    velocity_ned_m_s: Ned
+
+
+@dataclass(frozen=True, slots=True)
+class GlobalOrigin:
+    """GPS_GLOBAL_ORIGIN (49): where the local frame's origin lies."""
+
+    origin: Geodetic
+
+
+@dataclass(frozen=True, slots=True)
+class CurrentMode:
+    """CURRENT_MODE (436)."""
+
+    custom_mode: int
+    intended_custom_mode: int
+
+
+@dataclass(frozen=True, slots=True)
+class LandedState:
+    """EXTENDED_SYS_STATE (245): 1 on ground, 2 in air, 3 taking off, 4 landing."""
+
+    state: int
+
+
+@dataclass(frozen=True, slots=True)
+class EstimatorHealth:
+    """ESTIMATOR_STATUS (230)."""
+
+    flags: int
+    horizontal_accuracy_m: float
+    vertical_accuracy_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class SystemHealth:
+    """SYS_STATUS (1)."""
+
+    sensors_health: int
+    battery_percent: int
+    """-1: unknown"""
+
+
+@dataclass(frozen=True, slots=True)
+class CommandAnswer:
+    """COMMAND_ACK (77) to a command of ours."""
+
+    command: int
+    result: int
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """PARAM_VALUE (22), decoded by PX4's convention (INT32 bytewise in the float)."""
+
+    name: str
+    value: float | int
+
+
+Event = (
+    Heartbeat | LocalPosition | GlobalOrigin | CurrentMode | LandedState | EstimatorHealth | SystemHealth
+    | CommandAnswer | Parameter
+)  # fmt: skip
+
+_READ = frozenset({0, 1, 22, 32, 49, 77, 230, 245, 436})
+ORIGIN_MESSAGE_ID = 49
+STREAMS_HZ = {32: 50.0, 436: 20.0, 245: 5.0, 230: 1.0, 1: 1.0}
+"""what the companion asks for with SET_MESSAGE_INTERVAL"""
+STREAMS_OFF = (30, 31, 33, 105, 331, 111, 141, 132, 83, 85, 36, 74, 24, 87, 340)
+"""what a companion's link carries by default and nobody here reads"""
+
+
+class MavlinkLink:
+    """Codec of one vehicle's link: decodes what its autopilot says, encodes what the companion says."""
+
+    def __init__(self, system_id: int) -> None:
+        self.system_id = system_id
+        self.counts: Counter[str] = Counter()
+        self._out: Any = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=COMPANION_COMPONENT_ID)
+        self._in: Any = mavlink.MAVLink(None)
+        self._in.robust_parsing = True
+
+    def decode(self, datagram: bytes) -> list[Event]:
+        """The events in a datagram; damage and strangers are counted by kind."""
+        if len(datagram) >= 10 and datagram[0] == 0xFD:
+            # Most of a link's traffic is not for us; the header tells at a hundredth of a decoding's cost.
+            message_id = datagram[7] | datagram[8] << 8 | datagram[9] << 16
+            whole = len(datagram) == 12 + datagram[1] + (13 if datagram[2] & 1 else 0)
+            if whole and message_id not in _READ:
+                self.counts["not read"] += 1
+                return []
+        errors = self._in.total_receive_errors
+        messages = self._in.parse_buffer(datagram) or []
+        if self._in.total_receive_errors > errors or not messages:
+            self.counts["malformed"] += 1
+            self._in.buf.clear()
+            self._in.buf_index = 0
+        events = []
+        for message in messages:
+            event = self._event(message)
+            if event is not None:
+                events.append(event)
+        return events
+
+    def _event(self, message: Any) -> Event | None:
+        if isinstance(message, mavlink.MAVLink_bad_data):
+            return None
+        if message.get_srcSystem() != self.system_id or message.get_srcComponent() != AUTOPILOT_COMPONENT_ID:
+            self.counts["foreign system"] += 1
+            return None
+        match message:
+            case mavlink.MAVLink_local_position_ned_message():
+                numbers = (message.x, message.y, message.z, message.vx, message.vy, message.vz)
+                if not all(isfinite(x) for x in numbers):
+                    self.counts["not finite"] += 1
+                    return None
+                return LocalPosition(message.time_boot_ms, Ned(*numbers[:3]), Ned(*numbers[3:]))
+            case mavlink.MAVLink_heartbeat_message():
+                return Heartbeat(
+                    message.autopilot, message.type, bool(message.base_mode & 128), message.custom_mode,
+                    message.system_status,
+                )  # fmt: skip
+            case mavlink.MAVLink_current_mode_message():
+                return CurrentMode(message.custom_mode, message.intended_custom_mode)
+            case mavlink.MAVLink_extended_sys_state_message():
+                return LandedState(message.landed_state)
+            case mavlink.MAVLink_gps_global_origin_message():
+                return GlobalOrigin(
+                    Geodetic(message.latitude * 1e-7, message.longitude * 1e-7, message.altitude * 1e-3)
+                )
+            case mavlink.MAVLink_estimator_status_message():
+                accuracy = (message.pos_horiz_accuracy, message.pos_vert_accuracy)
+                return EstimatorHealth(message.flags, *(x if isfinite(x) else inf for x in accuracy))
+            case mavlink.MAVLink_sys_status_message():
+                return SystemHealth(message.onboard_control_sensors_health, message.battery_remaining)
+            case mavlink.MAVLink_command_ack_message():
+                if message.target_component not in (0, COMPANION_COMPONENT_ID):
+                    return None
+                return CommandAnswer(message.command, message.result)
+            case mavlink.MAVLink_param_value_message():
+                return Parameter(message.param_id.rstrip("\x00"), parameter_value(message))
+        self.counts["not read"] += 1
+        return None
+
+    def heartbeat(self) -> bytes:
+        """HEARTBEAT of an onboard controller."""
+        return self._pack(
+            mavlink.MAVLink_heartbeat_message(
+                mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 4, 3
+            )
+        )
+
+    def setpoint(
+        self, boot_ms: int, position_down_m: float, velocity_ned_m_s: Ned, acceleration_ne_m_s2: tuple[float, float],
+        yaw_rad: float,
+    ) -> bytes:  # fmt: skip
+        """SET_POSITION_TARGET_LOCAL_NED (84) in the autopilot's local frame, mask 0x903."""
+        v, (a_north, a_east) = velocity_ned_m_s, acceleration_ne_m_s2
+        return self._pack(
+            mavlink.MAVLink_set_position_target_local_ned_message(
+                boot_ms & 0xFFFFFFFF, self.system_id, AUTOPILOT_COMPONENT_ID, mavlink.MAV_FRAME_LOCAL_NED,
+                SETPOINT_TYPE_MASK, 0.0, 0.0, position_down_m, v.north, v.east, v.down, a_north, a_east, 0.0, yaw_rad,
+                0.0,
+            )
+        )  # fmt: skip
+
+    def command(self, command: int, *parameters: float) -> bytes:
+        """COMMAND_LONG (76); parameters left out are 0."""
+        values = [*parameters, *([0.0] * (7 - len(parameters)))]
+        return self._pack(
+            mavlink.MAVLink_command_long_message(self.system_id, AUTOPILOT_COMPONENT_ID, command, 0, *values)
+        )
+
+    def request_parameter(self, name: str) -> bytes:
+        """PARAM_REQUEST_READ (20) by name."""
+        return self._pack(
+            mavlink.MAVLink_param_request_read_message(self.system_id, AUTOPILOT_COMPONENT_ID, name.encode(), -1)
+        )
+
+    def _pack(self, message: Any) -> bytes:
+        data: bytes = bytes(message.pack(self._out))
+        # pack() leaves the sequence as it is; gaps in it are how the other side counts losses.
+        self._out.seq = (self._out.seq + 1) % 256
+        return data
+
+
+def parameter_value(message: Any) -> float | int:
+    """Value of a PARAM_VALUE: PX4 puts an INT32 bytewise into the float."""
+    if message.param_type == mavlink.MAV_PARAM_TYPE_INT32:
+        return int(struct.unpack("<i", struct.pack("<f", message.param_value))[0])
+    return float(message.param_value)
+
+
+def arm_parameters(arm: bool) -> tuple[int, float]:
+    """Command and parameter of MAV_CMD_COMPONENT_ARM_DISARM."""
+    return mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0 if arm else 0.0
+
+
+def mode_parameters(mode: Px4Mode) -> tuple[int, float, float, float]:
+    """Command and parameters of MAV_CMD_DO_SET_MODE for a PX4 mode."""
+    main, sub = (mode >> 16) & 0xFF, (mode >> 24) & 0xFF
+    return mavlink.MAV_CMD_DO_SET_MODE, float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED), float(main), float(sub)
+
+
+def takeoff_parameters(altitude_amsl_m: float) -> tuple[int, float, float, float, float, float, float, float]:
+    """Command and parameters of MAV_CMD_NAV_TAKEOFF: straight up, heading as it is."""
+    return mavlink.MAV_CMD_NAV_TAKEOFF, nan, 0.0, 0.0, nan, nan, nan, altitude_amsl_m
+
+
+def interval_parameters(message_id: int, rate_hz: float) -> tuple[int, float, float]:
+    """Command and parameters of MAV_CMD_SET_MESSAGE_INTERVAL; a rate of 0 turns the stream off."""
+    return mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, float(message_id), 1e6 / rate_hz if rate_hz > 0 else -1.0
+
+
+def request_message_parameters(message_id: int) -> tuple[int, float]:
+    """Command and parameter of MAV_CMD_REQUEST_MESSAGE."""
+    return mavlink.MAV_CMD_REQUEST_MESSAGE, float(message_id)

@@ -1,0 +1,166 @@
+"""Peer messages as bytes: little-endian, fixed layout, a version in front.
+
+    header  B version, B vehicle id, B phase, B digest entries, I boot id, I sequence, I revision, q motion start ns,
+            B motion issuer
+    sample  q time ns, 3f position (m), 3f velocity (m/s)                                  fleet frame, NED
+    digest  for each entry: B vehicle id, B phase, I revision, sample
+
+A motion travels as JSON (`encode_motion`): it is rare, and a person can read it in a capture.
+"""
+
+import json
+import struct
+from math import isfinite
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from companion.core.frames import Ned
+from companion.core.plan import GotoLeg, Leg, Motion, SlotChange, TurnLeg, VelocityLeg
+from companion.core.values import PeerMessage, PeerSample, Phase
+from companion.errors import WireError
+
+VERSION = 1
+_HEADER = struct.Struct("<BBBBIIIqB")
+_SAMPLE = struct.Struct("<q6f")
+_ENTRY = struct.Struct("<BBI")
+
+
+def encode_state(message: PeerMessage) -> bytes:
+    """A state message's payload."""
+    s = message.sample
+    parts = [
+        _HEADER.pack(
+            VERSION, s.vehicle_id, s.phase, len(message.digest), message.boot_id, message.sequence, s.revision,
+            message.motion_start_ns, message.motion_issuer,
+        ),
+        _sample_bytes(s),
+    ]  # fmt: skip
+    for entry in message.digest:
+        parts += [_ENTRY.pack(entry.vehicle_id, entry.phase, entry.revision), _sample_bytes(entry)]
+    return b"".join(parts)
+
+
+def _sample_bytes(s: PeerSample) -> bytes:
+    return _SAMPLE.pack(s.time_ns, *s.position_ned_m, *s.velocity_ned_m_s)
+
+
+def decode_state(payload: bytes) -> PeerMessage:
+    """A state message from its payload; WireError for a wrong version, length, phase or a number that is not finite."""
+    if len(payload) < 1 or payload[0] != VERSION:
+        raise WireError("version")
+    if len(payload) < _HEADER.size + _SAMPLE.size:
+        raise WireError("length")
+    _, vehicle_id, phase, entries, boot_id, sequence, revision, start_ns, issuer = _HEADER.unpack_from(payload)
+    each = _ENTRY.size + _SAMPLE.size
+    if len(payload) != _HEADER.size + _SAMPLE.size + entries * each:
+        raise WireError("length")
+    sample = _sample(payload, _HEADER.size, vehicle_id, phase, revision)
+    digest = []
+    for k in range(entries):
+        at = _HEADER.size + _SAMPLE.size + k * each
+        digest.append(_sample(payload, at + _ENTRY.size, *_ENTRY.unpack_from(payload, at)))
+    return PeerMessage(boot_id, sequence, start_ns, issuer, sample, tuple(digest))
+
+
+def _sample(payload: bytes, at: int, vehicle_id: int, phase: int, revision: int) -> PeerSample:
+    time_ns, *numbers = _SAMPLE.unpack_from(payload, at)
+    if not all(isfinite(x) for x in numbers):
+        raise WireError("not finite")
+    try:
+        known = Phase(phase)
+    except ValueError:
+        raise WireError("phase") from None
+    return PeerSample(vehicle_id, time_ns, Ned(*numbers[:3]), Ned(*numbers[3:]), revision, known)
+
+
+_Number = Annotated[float, Field(allow_inf_nan=False)]
+_Vector = tuple[_Number, _Number, _Number]
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+class _VelocityLeg(_Model):
+    kind: Literal["velocity"]
+    velocity_ned_m_s: _Vector
+    duration_s: Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+
+class _TurnLeg(_Model):
+    kind: Literal["turn"]
+    rate_rad_s: Annotated[float, Field(ge=-1.1, le=1.1, allow_inf_nan=False)]
+    angle_rad: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None
+    """None circles for ever (JSON knows no infinity)"""
+
+
+class _GotoLeg(_Model):
+    kind: Literal["goto"]
+    target_ned_m: _Vector
+    duration_s: Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+class _Motion(_Model):
+    version: Literal[1]
+    revision: Annotated[int, Field(ge=0, lt=1 << 32)]
+    start_ns: Annotated[int, Field(ge=0, lt=1 << 63)]
+    issuer: Annotated[int, Field(ge=0, le=255)]
+    shape: Annotated[str, Field(max_length=32)]
+    slots: dict[int, tuple[_Vector, _Vector]]
+    blend_start_ns: Annotated[int, Field(ge=0, lt=1 << 63)]
+    blend_s: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)]
+    legs_start_ns: Annotated[int, Field(ge=0, lt=1 << 63)]
+    centre_ned_m: _Vector
+    velocity_ned_m_s: _Vector
+    heading_rad: _Number
+    heading_rate_rad_s: _Number
+    heading_follows_turns: bool
+    legs: Annotated[
+        tuple[Annotated[_VelocityLeg | _TurnLeg | _GotoLeg, Field(discriminator="kind")], ...], Field(max_length=100)
+    ]
+    then: Literal["stay", "land"]
+
+
+def encode_motion(motion: Motion) -> bytes:
+    """A motion as JSON; floats survive exactly."""
+    legs = []
+    for leg in motion.legs:
+        match leg:
+            case VelocityLeg():
+                legs.append({"kind": leg.kind, "velocity_ned_m_s": leg.velocity_ned_m_s, "duration_s": leg.duration_s})
+            case TurnLeg():
+                angle = leg.angle_rad if isfinite(leg.angle_rad) else None
+                legs.append({"kind": leg.kind, "rate_rad_s": leg.rate_rad_s, "angle_rad": angle})
+            case GotoLeg():
+                legs.append({"kind": leg.kind, "target_ned_m": leg.target_ned_m, "duration_s": leg.duration_s})
+    fields = {name: getattr(motion, name) for name in _Motion.model_fields if name not in ("version", "legs")}
+    return json.dumps({"version": VERSION, **fields, "legs": legs}, separators=(",", ":")).encode()
+
+
+def decode_motion(payload: bytes) -> Motion:
+    """A motion from JSON; WireError for anything that is not exactly one."""
+    try:
+        m = _Motion.model_validate_json(payload)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise WireError(f"motion: {'.'.join(str(p) for p in first['loc'])}: {first['msg']}") from None
+    legs: list[Leg] = []
+    for leg in m.legs:
+        match leg:
+            case _VelocityLeg():
+                legs.append(VelocityLeg(Ned(*leg.velocity_ned_m_s), leg.duration_s))
+            case _TurnLeg():
+                if leg.rate_rad_s == 0.0:
+                    raise WireError("motion: a turn without a rate")
+                legs.append(TurnLeg(leg.rate_rad_s, float("inf") if leg.angle_rad is None else leg.angle_rad))
+            case _GotoLeg():
+                legs.append(GotoLeg(Ned(*leg.target_ned_m), leg.duration_s))
+    return Motion(
+        revision=m.revision, start_ns=m.start_ns, issuer=m.issuer, shape=m.shape,
+        slots={i: SlotChange(Ned(*a), Ned(*b)) for i, (a, b) in m.slots.items()},
+        blend_start_ns=m.blend_start_ns, blend_s=m.blend_s, legs_start_ns=m.legs_start_ns,
+        centre_ned_m=Ned(*m.centre_ned_m), velocity_ned_m_s=Ned(*m.velocity_ned_m_s),
+        heading_rad=m.heading_rad, heading_rate_rad_s=m.heading_rate_rad_s,
+        heading_follows_turns=m.heading_follows_turns, legs=tuple(legs), then=m.then,
+    )  # fmt: skip

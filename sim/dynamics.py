@@ -1,0 +1,508 @@
+"""Point-mass dynamics of a multicopter under PX4's position controller, gusts, and the estimator's errors. Pure.
+
+All vectors are north-east-down, in metres, m/s and m/s². Time advances only by the `dt_s` a caller passes; whoever
+needs reproducible runs passes the same grid. Random numbers come from the generator that is passed in.
+
+Two models share one body:
+
+* `px4`: PX4's multicopter position controller (PositionControl.cpp) as measured on PX4 1.16:
+      v_sp = v_ff + K_p (p_sp - p)                    each axis on its own; a NaN term has no influence
+      a_sp = a_ff + P (v_sp - v) + ∫ I (v_sp - v) - D v'   without a velocity set-point: a_ff alone, nothing feeds back
+  with its limits, its tilt limit and its anti-windup, behind first-order lags of attitude and thrust.
+* `ideal`: a double integrator with an optional lag, for studies: an acceleration set-point is flown exactly, velocity
+  and position through proportional loops without an integrator.
+"""
+
+import math
+import random
+from dataclasses import dataclass
+from math import isnan
+from typing import Literal, NamedTuple
+
+GRAVITY_M_S2 = 9.80665
+"""standard gravity, CONSTANTS_ONE_G of PX4"""
+THRUST_MIN_G = 0.24
+"""least thrust per mass in flight, in units of gravity (MPC_THR_MIN 0.12 with MPC_THR_HOVER 0.5)"""
+LANDED_THRUST_LOSS = 0.68
+"""share of the weight no longer carried at which the land detector calls the thrust low: MPC_THR_MIN plus a tenth of
+the way to hover"""
+NAN = math.nan
+
+
+class Setpoint(NamedTuple):
+    """What a controller is asked to reach, in the frame of its own position; NaN: this axis is not controlled by it."""
+
+    north_m: float = NAN
+    east_m: float = NAN
+    down_m: float = NAN
+    velocity_north_m_s: float = NAN
+    velocity_east_m_s: float = NAN
+    velocity_down_m_s: float = NAN
+    acceleration_north_m_s2: float = NAN
+    acceleration_east_m_s2: float = NAN
+    acceleration_down_m_s2: float = NAN
+    yaw_rad: float = NAN
+    yaw_rate_rad_s: float = NAN
+
+    def is_flyable(self) -> bool:
+        """PX4's own check: every axis is controlled by something, and north and east are given in pairs."""
+        pairs = (
+            (self.north_m, self.east_m),
+            (self.velocity_north_m_s, self.velocity_east_m_s),
+            (self.acceleration_north_m_s2, self.acceleration_east_m_s2),
+        )
+        if any(math.isnan(north) != math.isnan(east) for north, east in pairs):
+            return False
+        horizontal = any(not math.isnan(north) for north, _ in pairs)
+        vertical = (self.down_m, self.velocity_down_m_s, self.acceleration_down_m_s2)
+        return horizontal and not all(math.isnan(value) for value in vertical)
+
+
+HOLD_STILL = Setpoint(velocity_north_m_s=0.0, velocity_east_m_s=0.0, velocity_down_m_s=0.0)
+"""zero velocity on every axis: what PX4 flies when a set-point cannot be flown"""
+
+
+@dataclass(frozen=True, slots=True)
+class DynamicsParameters:
+    """Physics of one vehicle, and the loop's constants that PX4 does not offer as parameters."""
+
+    model: Literal["px4", "ideal"] = "px4"
+    """`px4`: PX4's loops; `ideal`: double integrator for studies"""
+    attitude_lag_s: float = 0.12
+    """time constant from commanded to flown horizontal acceleration (tilt), s; 0: none"""
+    thrust_lag_s: float = 0.05
+    """time constant from commanded to flown vertical acceleration (motors), s; 0: none"""
+    drag_per_s: float = 0.1
+    """linear drag: acceleration -drag·v, 1/s. PX4's SIH: 1.0 by default"""
+    thrust_max_g: float = 2.0
+    """largest thrust per mass, in units of gravity"""
+    ideal_velocity_gain_per_s: float = 2.0
+    """`ideal` only: acceleration per velocity error, 1/s"""
+    ideal_position_gain_per_s: float = 0.5
+    """`ideal` only: velocity per position error, 1/s; a quarter of the velocity gain is critically damped"""
+    yaw_gain_per_s: float = 2.8
+    """yaw rate per yaw error, 1/s (MC_YAW_P)"""
+    yaw_rate_max_rad_s: float = 1.05
+    """largest yaw rate, rad/s (MPC_YAWRAUTO_MAX, 60 deg/s)"""
+
+    def __post_init__(self) -> None:
+        if self.model not in ("px4", "ideal"):
+            raise ValueError(f"model must be 'px4' or 'ideal', got {self.model!r}")
+        for name in ("attitude_lag_s", "thrust_lag_s", "drag_per_s"):
+            _require(name, getattr(self, name), 0.0 <= getattr(self, name) < math.inf, ">= 0")
+        for name in (
+            "ideal_velocity_gain_per_s",
+            "ideal_position_gain_per_s",
+            "yaw_gain_per_s",
+            "yaw_rate_max_rad_s",
+        ):
+            _require(name, getattr(self, name), 0.0 < getattr(self, name) < math.inf, "> 0")
+        _require("thrust_max_g", self.thrust_max_g, 1.0 < self.thrust_max_g < math.inf, "> 1")
+
+
+@dataclass(frozen=True, slots=True)
+class GustParameters:
+    """Disturbance: an Ornstein-Uhlenbeck acceleration per axis, stationary sigma, clipped."""
+
+    sigma_m_s2: float = 0.3
+    """standard deviation per axis, m/s²; 0: calm"""
+    time_constant_s: float = 1.0
+    """correlation time, s"""
+    bound_m_s2: float = 1.0
+    """the disturbance never exceeds this on any axis, m/s²"""
+
+    def __post_init__(self) -> None:
+        _require("sigma_m_s2", self.sigma_m_s2, 0.0 <= self.sigma_m_s2 < math.inf, ">= 0")
+        _require("time_constant_s", self.time_constant_s, 0.0 < self.time_constant_s < math.inf, "> 0")
+        _require("bound_m_s2", self.bound_m_s2, 0.0 <= self.bound_m_s2 < math.inf, ">= 0")
+
+
+@dataclass(frozen=True, slots=True)
+class NoiseParameters:
+    """Errors of the estimate that an autopilot flies by and reports."""
+
+    position_sigma_m: float = 0.05
+    """standard deviation per axis, m; correlated"""
+    position_time_constant_s: float = 2.0
+    """correlation time of the position error, s"""
+    velocity_sigma_m_s: float = 0.05
+    """standard deviation per axis, m/s; white: in what is reported, not in what the loops fly by"""
+    velocity_bias_sigma_m_s: float = 0.0
+    """standard deviation per axis of a slow error of the velocity, m/s; the loops fly by it"""
+    velocity_bias_time_constant_s: float = 30.0
+    """correlation time of that slow error, s"""
+
+    def __post_init__(self) -> None:
+        for name in ("position_sigma_m", "velocity_sigma_m_s", "velocity_bias_sigma_m_s"):
+            _require(name, getattr(self, name), 0.0 <= getattr(self, name) < math.inf, ">= 0")
+        for name in ("position_time_constant_s", "velocity_bias_time_constant_s"):
+            _require(name, getattr(self, name), 0.0 < getattr(self, name) < math.inf, "> 0")
+
+
+def _require(name: str, value: float, allowed: bool, range_text: str) -> None:
+    if not allowed:
+        raise ValueError(f"{name} must be {range_text}, got {value}")
+
+
+@dataclass(slots=True)
+class LoopGains:
+    """PX4's controller parameters (MPC_*); mutable, since PARAM_SET acts on them in flight."""
+
+    position_horizontal_per_s: float = 0.95
+    position_vertical_per_s: float = 1.0
+    velocity_horizontal_p: float = 1.8
+    velocity_horizontal_i: float = 0.4
+    velocity_horizontal_d: float = 0.2
+    velocity_vertical_p: float = 4.0
+    velocity_vertical_i: float = 2.0
+    velocity_vertical_d: float = 0.0
+    speed_max_horizontal_m_s: float = 12.0
+    speed_max_up_m_s: float = 3.0
+    speed_max_down_m_s: float = 1.5
+    tilt_max_rad: float = math.radians(45.0)
+
+
+class OrnsteinUhlenbeck:
+    """Three independent Ornstein-Uhlenbeck processes, started from their stationary distribution."""
+
+    __slots__ = ("_bound", "_decay", "_kick", "_random", "_sigma", "down", "east", "north")
+
+    def __init__(
+        self, sigma: float, time_constant_s: float, dt_s: float, rng: random.Random, bound: float = math.inf
+    ) -> None:
+        self._sigma = sigma
+        self._bound = bound
+        self._decay = math.exp(-dt_s / time_constant_s)
+        self._kick = sigma * math.sqrt(1.0 - self._decay * self._decay)
+        self._random = rng
+        self.north = self.east = self.down = 0.0
+        if sigma > 0.0:
+            self.north, self.east, self.down = (self._clip(rng.gauss(0.0, sigma)) for _ in range(3))
+
+    def _clip(self, value: float) -> float:
+        return min(max(value, -self._bound), self._bound)
+
+    def step(self) -> None:
+        """Advances by the fixed step given at construction."""
+        if self._kick == 0.0:
+            return
+        gauss = self._random.gauss
+        bound = self._bound
+        north = self.north * self._decay + gauss(0.0, self._kick)
+        east = self.east * self._decay + gauss(0.0, self._kick)
+        down = self.down * self._decay + gauss(0.0, self._kick)
+        self.north = bound if north > bound else (-bound if north < -bound else north)
+        self.east = bound if east > bound else (-bound if east < -bound else east)
+        self.down = bound if down > bound else (-bound if down < -bound else down)
+
+
+def constrain_horizontal(
+    first_north: float, first_east: float, second_north: float, second_east: float, limit: float
+) -> tuple[float, float]:
+    """Sum of two vectors, no longer than `limit`, keeping the first at the second's cost (ControlMath::constrainXY)."""
+    north = first_north + second_north
+    east = first_east + second_east
+    if north * north + east * east <= limit * limit:
+        return north, east
+    first_length = math.hypot(first_north, first_east)
+    if first_length >= limit or math.hypot(second_north - first_north, second_east - first_east) < 0.001:
+        return first_north / first_length * limit, first_east / first_length * limit
+    second_length = math.hypot(second_north, second_east)
+    unit_north = second_north / second_length
+    unit_east = second_east / second_length
+    along = unit_north * first_north + unit_east * first_east
+    room = first_length * first_length - limit * limit
+    scale = -along + math.sqrt(along * along - room)
+    return first_north + unit_north * scale, first_east + unit_east * scale
+
+
+def wrap_angle_rad(angle_rad: float) -> float:
+    """The same direction within -pi..pi."""
+    return math.remainder(angle_rad, math.tau)
+
+
+class Vehicle:
+    """One multicopter's true motion. Mutable; the frame's origin is the caller's, `ground_down_m` is the floor in it.
+
+    The controller works on an estimate: true position plus `position_error`, true velocity plus `velocity_error`, set
+    by the caller before each step, and set-points are in the frame of that estimate.
+    """
+
+    __slots__ = (
+        "_integral_down",
+        "_integral_east",
+        "_integral_north",
+        "_slope_down",
+        "_slope_east",
+        "_slope_north",
+        "acceleration_down_m_s2",
+        "acceleration_east_m_s2",
+        "acceleration_north_m_s2",
+        "command_down_m_s2",
+        "command_east_m_s2",
+        "command_north_m_s2",
+        "command_velocity_down_m_s",
+        "command_velocity_east_m_s",
+        "command_velocity_north_m_s",
+        "down_m",
+        "east_m",
+        "gains",
+        "ground_down_m",
+        "north_m",
+        "on_ground",
+        "parameters",
+        "position_error_down_m",
+        "position_error_east_m",
+        "position_error_north_m",
+        "thrust_down_m_s2",
+        "thrust_east_m_s2",
+        "thrust_min_g",
+        "thrust_north_m_s2",
+        "velocity_down_m_s",
+        "velocity_east_m_s",
+        "velocity_error_down_m_s",
+        "velocity_error_east_m_s",
+        "velocity_error_north_m_s",
+        "velocity_north_m_s",
+        "yaw_rad",
+        "yaw_rate_rad_s",
+    )
+
+    DERIVATIVE_FILTER_S = 1.0 / (math.tau * 5.0)
+    """time constant of the filter on the velocity's derivative, s (MPC_VELD_LP, 5 Hz)"""
+
+    def __init__(
+        self,
+        north_m: float,
+        east_m: float,
+        down_m: float,
+        parameters: DynamicsParameters,
+        gains: LoopGains | None = None,
+        yaw_rad: float = 0.0,
+    ) -> None:
+        self.parameters = parameters
+        self.gains = gains if gains is not None else LoopGains()
+        self.north_m, self.east_m, self.down_m = north_m, east_m, down_m
+        self.ground_down_m = down_m
+        self.on_ground = True
+        self.thrust_min_g = THRUST_MIN_G
+        self.yaw_rad = yaw_rad
+        self.yaw_rate_rad_s = 0.0
+        self.velocity_north_m_s = self.velocity_east_m_s = self.velocity_down_m_s = 0.0
+        self.acceleration_north_m_s2 = self.acceleration_east_m_s2 = self.acceleration_down_m_s2 = 0.0
+        self.command_north_m_s2 = self.command_east_m_s2 = self.command_down_m_s2 = 0.0
+        self.command_velocity_north_m_s = self.command_velocity_east_m_s = self.command_velocity_down_m_s = NAN
+        self.thrust_north_m_s2 = self.thrust_east_m_s2 = 0.0
+        self.thrust_down_m_s2 = GRAVITY_M_S2
+        self.position_error_north_m = self.position_error_east_m = self.position_error_down_m = 0.0
+        self.velocity_error_north_m_s = self.velocity_error_east_m_s = self.velocity_error_down_m_s = 0.0
+        self._slope_north = self._slope_east = self._slope_down = 0.0
+        self._integral_north = self._integral_east = self._integral_down = 0.0
+
+    def control(self, setpoint: Setpoint, dt_s: float) -> None:
+        """Turns a set-point into the commanded acceleration (before lag, drag and gust)."""
+        if self.parameters.model == "px4":
+            self._control_px4(setpoint, dt_s)
+        else:
+            self._control_ideal(setpoint)
+        self._turn(setpoint.yaw_rad, setpoint.yaw_rate_rad_s, dt_s)
+
+    def idle(self) -> None:
+        """Motors at their lowest or stopped: falls when in the air, and the loops start afresh."""
+        self.command_north_m_s2 = self.command_east_m_s2 = 0.0
+        self.command_down_m_s2 = GRAVITY_M_S2
+        self.command_velocity_north_m_s = self.command_velocity_east_m_s = self.command_velocity_down_m_s = NAN
+        self.yaw_rate_rad_s = 0.0
+        self.reset_integrals()
+
+    def reset_integrals(self) -> None:
+        """Forgets what the velocity loop has learned."""
+        self._integral_north = self._integral_east = self._integral_down = 0.0
+
+    def _velocity_setpoint(
+        self, setpoint: Setpoint, gain_horizontal: float, gain_vertical: float
+    ) -> tuple[float, float, float]:
+        """Velocity asked for by the position loop and the feed-forward together, limited; NaN: none."""
+        gains = self.gains
+        from_north = gain_horizontal * (setpoint.north_m - self.north_m - self.position_error_north_m)
+        from_east = gain_horizontal * (setpoint.east_m - self.east_m - self.position_error_east_m)
+        from_down = gain_vertical * (setpoint.down_m - self.down_m - self.position_error_down_m)
+        north, east, down = (
+            setpoint.velocity_north_m_s,
+            setpoint.velocity_east_m_s,
+            setpoint.velocity_down_m_s,
+        )
+        if not isnan(from_north):
+            north = from_north if isnan(north) else north + from_north
+        else:
+            from_north = 0.0
+        if not isnan(from_east):
+            east = from_east if isnan(east) else east + from_east
+        else:
+            from_east = 0.0
+        if not isnan(from_down):
+            down = from_down if isnan(down) else down + from_down
+        limit = gains.speed_max_horizontal_m_s
+        if north * north + east * east > limit * limit:
+            north, east = constrain_horizontal(from_north, from_east, north - from_north, east - from_east, limit)
+        if down > gains.speed_max_down_m_s:
+            down = gains.speed_max_down_m_s
+        elif down < -gains.speed_max_up_m_s:
+            down = -gains.speed_max_up_m_s
+        self.command_velocity_north_m_s = north
+        self.command_velocity_east_m_s = east
+        self.command_velocity_down_m_s = down
+        return north, east, down
+
+    def _control_px4(self, setpoint: Setpoint, dt_s: float) -> None:
+        gains = self.gains
+        north, east, down = self._velocity_setpoint(
+            setpoint, gains.position_horizontal_per_s, gains.position_vertical_per_s
+        )
+        error_north = north - self.velocity_north_m_s - self.velocity_error_north_m_s
+        error_east = east - self.velocity_east_m_s - self.velocity_error_east_m_s
+        error_down = down - self.velocity_down_m_s - self.velocity_error_down_m_s
+        p, d = gains.velocity_horizontal_p, gains.velocity_horizontal_d
+        a_north = setpoint.acceleration_north_m_s2
+        a_east = setpoint.acceleration_east_m_s2
+        a_down = setpoint.acceleration_down_m_s2
+        has_north = not isnan(error_north)
+        has_east = not isnan(error_east)
+        has_down = not isnan(error_down)
+        if has_north:
+            feedback = error_north * p + self._integral_north - self._slope_north * d
+            a_north = feedback if isnan(a_north) else a_north + feedback
+        else:
+            error_north = 0.0
+        if has_east:
+            feedback = error_east * p + self._integral_east - self._slope_east * d
+            a_east = feedback if isnan(a_east) else a_east + feedback
+        else:
+            error_east = 0.0
+        if has_down:
+            feedback = (
+                error_down * gains.velocity_vertical_p
+                + self._integral_down
+                - self._slope_down * gains.velocity_vertical_d
+            )
+            a_down = feedback if isnan(a_down) else a_down + feedback
+        else:
+            error_down = 0.0
+        # Tilt: horizontal force comes from tilting a thrust that carries the weight.
+        limit = GRAVITY_M_S2 * math.tan(gains.tilt_max_rad)
+        wanted = math.hypot(a_north, a_east)
+        if wanted > limit:
+            scale = limit / wanted
+            # Anti-windup by tracking what saturation leaves (Rundqwist), as PX4 does.
+            tracking = 2.0 / p if p > 0.0 else 0.0
+            error_north -= tracking * (a_north - a_north * scale)
+            error_east -= tracking * (a_east - a_east * scale)
+            a_north *= scale
+            a_east *= scale
+        most_up = GRAVITY_M_S2 * (1.0 - self.parameters.thrust_max_g)
+        most_down = GRAVITY_M_S2 * (1.0 - self.thrust_min_g)
+        if a_down < most_up:
+            a_down = most_up
+            error_down = max(error_down, 0.0)
+        elif a_down > most_down:
+            a_down = most_down
+            error_down = min(error_down, 0.0)
+        self._integral_north += error_north * gains.velocity_horizontal_i * dt_s
+        self._integral_east += error_east * gains.velocity_horizontal_i * dt_s
+        integral_down = self._integral_down + error_down * gains.velocity_vertical_i * dt_s
+        self._integral_down = min(max(integral_down, -GRAVITY_M_S2), GRAVITY_M_S2)
+        self.command_north_m_s2 = a_north
+        self.command_east_m_s2 = a_east
+        self.command_down_m_s2 = a_down
+
+    def _control_ideal(self, setpoint: Setpoint) -> None:
+        gain = self.parameters.ideal_velocity_gain_per_s
+        position_gain = self.parameters.ideal_position_gain_per_s
+        north, east, down = self._velocity_setpoint(setpoint, position_gain, position_gain)
+        commands = []
+        for target, velocity, feed_forward in (
+            (north, self.velocity_north_m_s + self.velocity_error_north_m_s, setpoint.acceleration_north_m_s2),
+            (east, self.velocity_east_m_s + self.velocity_error_east_m_s, setpoint.acceleration_east_m_s2),
+            (down, self.velocity_down_m_s + self.velocity_error_down_m_s, setpoint.acceleration_down_m_s2),
+        ):
+            a = 0.0 if isnan(feed_forward) else feed_forward
+            if not isnan(target):
+                a += gain * (target - velocity)
+            commands.append(a)
+        self.command_north_m_s2, self.command_east_m_s2, self.command_down_m_s2 = commands
+
+    def _turn(self, yaw_rad: float, yaw_rate_rad_s: float, dt_s: float) -> None:
+        limit = self.parameters.yaw_rate_max_rad_s
+        rate = 0.0 if isnan(yaw_rate_rad_s) else yaw_rate_rad_s
+        if not isnan(yaw_rad):
+            rate += self.parameters.yaw_gain_per_s * wrap_angle_rad(yaw_rad - self.yaw_rad)
+        rate = min(max(rate, -limit), limit)
+        self.yaw_rate_rad_s = rate
+        if rate != 0.0:
+            self.yaw_rad = wrap_angle_rad(self.yaw_rad + rate * dt_s)
+
+    def move(self, gust_north_m_s2: float, gust_east_m_s2: float, gust_down_m_s2: float, dt_s: float) -> None:
+        """Integrates the motion over one step: lag, drag, gust, ground."""
+        parameters = self.parameters
+        lag = parameters.attitude_lag_s
+        blend = dt_s / (lag + dt_s)
+        self.thrust_north_m_s2 += (self.command_north_m_s2 - self.thrust_north_m_s2) * blend
+        self.thrust_east_m_s2 += (self.command_east_m_s2 - self.thrust_east_m_s2) * blend
+        self.thrust_down_m_s2 += (self.command_down_m_s2 - self.thrust_down_m_s2) * (
+            dt_s / (parameters.thrust_lag_s + dt_s)
+        )
+        if self.on_ground:
+            if self.thrust_down_m_s2 >= -0.05:
+                self._rest()
+                return
+            self.on_ground = False
+        drag = parameters.drag_per_s
+        # Less thrust than weight also means less horizontal force at the same tilt.
+        loading = 1.0 if parameters.model == "ideal" else (GRAVITY_M_S2 - self.thrust_down_m_s2) / GRAVITY_M_S2
+        a_north = self.thrust_north_m_s2 * loading - drag * self.velocity_north_m_s + gust_north_m_s2
+        a_east = self.thrust_east_m_s2 * loading - drag * self.velocity_east_m_s + gust_east_m_s2
+        a_down = self.thrust_down_m_s2 - drag * self.velocity_down_m_s + gust_down_m_s2
+        smooth = dt_s / (self.DERIVATIVE_FILTER_S + dt_s)
+        self._slope_north += (a_north - self._slope_north) * smooth
+        self._slope_east += (a_east - self._slope_east) * smooth
+        self._slope_down += (a_down - self._slope_down) * smooth
+        # Exact for an acceleration that is constant over the step.
+        half = 0.5 * dt_s
+        self.north_m += (self.velocity_north_m_s + half * a_north) * dt_s
+        self.east_m += (self.velocity_east_m_s + half * a_east) * dt_s
+        self.down_m += (self.velocity_down_m_s + half * a_down) * dt_s
+        self.velocity_north_m_s += a_north * dt_s
+        self.velocity_east_m_s += a_east * dt_s
+        self.velocity_down_m_s += a_down * dt_s
+        self.acceleration_north_m_s2 = a_north
+        self.acceleration_east_m_s2 = a_east
+        self.acceleration_down_m_s2 = a_down
+        if self.down_m >= self.ground_down_m and self.velocity_down_m_s >= 0.0:
+            self.down_m = self.ground_down_m
+            self.on_ground = True
+            self._rest()
+
+    def _rest(self) -> None:
+        self.velocity_north_m_s = self.velocity_east_m_s = self.velocity_down_m_s = 0.0
+        self.acceleration_north_m_s2 = self.acceleration_east_m_s2 = self.acceleration_down_m_s2 = 0.0
+        self._slope_north = self._slope_east = self._slope_down = 0.0
+
+    def presses_down(self) -> bool:
+        """On the ground with hardly any thrust left: what PX4's land detector takes for a landing."""
+        if not self.on_ground:
+            return False
+        if self.parameters.model == "ideal":
+            return not self.command_velocity_down_m_s <= 0.05
+        return self.command_down_m_s2 > LANDED_THRUST_LOSS * GRAVITY_M_S2
+
+    def attitude_rad(self) -> tuple[float, float, float]:
+        """Roll, pitch and yaw of the thrust that is flown; level on the ground."""
+        if self.on_ground:
+            return 0.0, 0.0, self.yaw_rad
+        # Before the vertical thrust's loading the tilt is that of (a, g), see `move`.
+        cos_yaw, sin_yaw = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
+        forward = cos_yaw * self.thrust_north_m_s2 + sin_yaw * self.thrust_east_m_s2
+        right = -sin_yaw * self.thrust_north_m_s2 + cos_yaw * self.thrust_east_m_s2
+        pitch = -math.atan2(forward, GRAVITY_M_S2)
+        roll = math.atan2(right * math.cos(pitch), GRAVITY_M_S2)
+        return roll, pitch, self.yaw_rad

@@ -1,0 +1,230 @@
+"""Lockstep: N agents, N stub autopilots and a seeded network on one integer-nanosecond clock, in one thread.
+
+They speak the real MAVLink and peer bytes; only sockets and waiting are missing. Same seed, same bits.
+"""
+
+import heapq
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from random import Random
+
+import numpy as np
+
+from companion.agent import Agent, Outputs
+from companion.config import FleetConfig
+from companion.core.frames import Ned
+from companion.core.values import Instant, Phase
+from sim.autopilot import Autopilot
+from sim.network import Network, NetworkParameters
+from sim.stub_fleet import stub_settings
+from sim.stubs import TRUTH_DTYPE, build_autopilot
+
+UTC_AT_START_NS = 1_700_000_000_000_000_000
+LINK_DELAY_NS = 300_000
+"""one way between autopilot and companion"""
+PRESENCE_DELAY_NS = 100_000_000
+TRUTH_INTERVAL_NS = 20_000_000
+
+
+@dataclass(slots=True)
+class Vehicle:
+    """One vehicle in lockstep."""
+
+    agent: Agent
+    autopilot: Autopilot
+    alive: bool = True
+    """whether the companion runs"""
+    truth_gap_ns: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Sent:
+    """One put of a companion, for the count of messages."""
+
+    time_ns: int
+    vehicle_id: int
+    topic: str
+    size: int
+
+
+@dataclass(slots=True)
+class Lockstep:
+    """A fleet in lockstep. Drive it with `run_until`, `take_off`, `command`, and the faults."""
+
+    config: FleetConfig
+    seed: int = 0
+    network: NetworkParameters = NetworkParameters()
+    record: Callable[[int, str, Instant, bytes], None] | None = None
+    """called with every input and output of every agent: (vehicle id, channel, time, body)"""
+    now_ns: int = 0
+    vehicles: dict[int, Vehicle] = field(init=False)
+    sent: list[Sent] = field(default_factory=list)
+    notes: list[tuple[float, int, str]] = field(default_factory=list)
+    """(seconds, vehicle, what happened)"""
+    _truth: list[np.ndarray] = field(default_factory=list)
+    _net: Network = field(init=False)
+    _queue: list[tuple[int, int, Callable[[], None]]] = field(default_factory=list)
+    _count: int = 0
+
+    def __post_init__(self) -> None:
+        self._net = Network(self.network, self.seed)
+        random = Random(self.seed)
+        self.vehicles = {}
+        settings = stub_settings(self.config, seed=self.seed)
+        for v in settings.vehicles:
+            autopilot = build_autopilot(settings, v, boot_ns=0, utc_offset_ns=UTC_AT_START_NS)
+            agent = Agent(self.config, v.vehicle_id, boot_id=random.getrandbits(32))
+            self.vehicles[v.vehicle_id] = Vehicle(agent, autopilot)
+        for i in self.vehicles:
+            self._announce_presence(i, True)
+        self._at(TRUTH_INTERVAL_NS, self._sample_truth)
+
+    @property
+    def now(self) -> Instant:
+        """The present, as every agent is told."""
+        return Instant(self.now_ns, self.now_ns + UTC_AT_START_NS)
+
+    def _at(self, time_ns: int, action: Callable[[], None]) -> None:
+        self._count += 1
+        heapq.heappush(self._queue, (time_ns, self._count, action))
+
+    def _announce_presence(self, i: int, alive: bool) -> None:
+        for j in self.vehicles:
+            if j != i:
+                self._at(self.now_ns + PRESENCE_DELAY_NS, lambda j=j: self._presence(j, i, alive))  # type: ignore[misc]
+
+    def _presence(self, receiver: int, about: int, alive: bool) -> None:
+        if self.vehicles[receiver].alive:
+            self._log(receiver, "input/presence", bytes((about, alive)))
+            self.vehicles[receiver].agent.receive_presence(about, alive, self.now)
+
+    def _log(self, i: int, channel: str, body: bytes) -> None:
+        if self.record is not None:
+            self.record(i, channel, self.now, body)
+
+    # -- the event loop ----------------------------------------------------------------------------------------------
+
+    def run_until(self, time_s: float, stop: Callable[[], bool] | None = None) -> None:
+        """Let time pass until `time_s` from the start, or until `stop()` (asked ten times a second) is true."""
+        end_ns = round(time_s * 1e9)
+        next_check_ns = self.now_ns
+        while True:
+            if stop is not None and self.now_ns >= next_check_ns:
+                if stop():
+                    return
+                next_check_ns = self.now_ns + 100_000_000
+            time_ns = self._queue[0][0]
+            for v in self.vehicles.values():
+                time_ns = min(time_ns, v.autopilot.next_deadline_ns())
+                if v.alive:
+                    time_ns = min(time_ns, v.agent.next_deadline_ns())
+            if time_ns > end_ns:
+                self.now_ns = end_ns
+                return
+            self.now_ns = max(time_ns, self.now_ns)
+            self._step()
+
+    def _step(self) -> None:
+        now_ns = self.now_ns
+        while self._queue and self._queue[0][0] <= now_ns:
+            heapq.heappop(self._queue)[2]()
+        for i, v in self.vehicles.items():
+            if v.autopilot.next_deadline_ns() <= now_ns:
+                datagrams = v.autopilot.advance(now_ns)
+                if datagrams and v.alive:
+                    self._at(now_ns + LINK_DELAY_NS, lambda i=i, d=datagrams: self._to_companion(i, d))  # type: ignore[misc]
+        for i, v in self.vehicles.items():
+            if v.alive and v.agent.next_deadline_ns() <= now_ns:
+                self._advance(i)
+
+    def _to_companion(self, i: int, datagrams: Iterable[bytes]) -> None:
+        v = self.vehicles[i]
+        if not v.alive:
+            return
+        for datagram in datagrams:
+            self._log(i, "input/mavlink", datagram)
+            v.agent.receive_mavlink(datagram, self.now)
+
+    def _to_autopilot(self, i: int, datagrams: Iterable[bytes]) -> None:
+        for datagram in datagrams:
+            self.vehicles[i].autopilot.receive(datagram, self.now_ns)
+
+    def _advance(self, i: int) -> None:
+        v = self.vehicles[i]
+        self._log(i, "advance", b"")
+        out: Outputs = v.agent.advance(self.now)
+        for datagram in out.mavlink:
+            self._log(i, "output/mavlink", datagram)
+        if out.mavlink:
+            self._at(self.now_ns + LINK_DELAY_NS, lambda: self._to_autopilot(i, out.mavlink))
+        for topic, payload in out.peers:
+            self._log(i, "output/peer", f"{topic}\0".encode() + payload)
+            self.sent.append(Sent(self.now_ns, i, topic, len(payload)))
+            key = f"fleet/{i}/{topic}"
+            for j in self.vehicles:
+                arrival = None if j == i else self._net.arrival_ns(i, j, self.now_ns)
+                if arrival is not None:
+                    self._at(arrival, lambda j=j, p=payload, k=key: self._to_peer(j, k, p))  # type: ignore[misc]
+        self.notes += [(self.now_ns * 1e-9, i, note) for note in out.notes]
+
+    def _to_peer(self, j: int, key: str, payload: bytes) -> None:
+        v = self.vehicles[j]
+        if v.alive:
+            self._log(j, "input/peer", key.encode() + b"\0" + payload)
+            v.agent.receive_peer(key, payload, self.now)
+
+    # -- what a test or a study does with it -------------------------------------------------------------------------
+
+    def command(self, payload: bytes) -> dict[int, bytes]:
+        """An operator's command to every companion that runs; their answers."""
+        answers = {}
+        for i, v in self.vehicles.items():
+            if v.alive:
+                self._log(i, "input/command", payload)
+                answers[i] = v.agent.receive_command(payload, self.now)
+        return answers
+
+    def kill(self, i: int) -> None:
+        """End a companion without a word, as kill -9 does; its autopilot flies on."""
+        self.vehicles[i].alive = False
+        self._announce_presence(i, False)
+
+    def restart(self, i: int) -> None:
+        """Start a killed companion anew, with nothing of its memory."""
+        v = self.vehicles[i]
+        self.vehicles[i] = replace(
+            v, agent=Agent(self.config, i, boot_id=Random(f"{self.seed}/{i}/{self.now_ns}").getrandbits(32)), alive=True
+        )
+        self._announce_presence(i, True)
+
+    def partition(self, *parts: Iterable[int]) -> None:
+        """Cut the network into parts that do not hear each other; no parts: it is whole again."""
+        self._net.partitions = tuple(frozenset(p) for p in parts)
+
+    def phases(self) -> dict[int, Phase]:
+        """Each running companion's phase."""
+        return {i: v.agent.phase for i, v in self.vehicles.items() if v.alive}
+
+    def all_in(self, *phases: Phase) -> bool:
+        """Whether every running companion is in one of the phases."""
+        return all(p in phases for p in self.phases().values())
+
+    def truth(self) -> np.ndarray:
+        """Every vehicle's true state at 50 Hz, as TRUTH_DTYPE records."""
+        return np.concatenate(self._truth) if self._truth else np.zeros(0, TRUTH_DTYPE)
+
+    def _sample_truth(self) -> None:
+        rows = np.zeros(len(self.vehicles), TRUTH_DTYPE)
+        for row, (i, v) in zip(rows, self.vehicles.items(), strict=True):
+            t = v.autopilot.truth()
+            row["time_unix_ns"] = self.now.fleet_ns
+            row["vehicle_id"], row["armed"], row["landed_state"] = i, t.armed, t.landed_state
+            row["custom_mode"] = t.custom_mode
+            row["position_ned_m"], row["velocity_ned_m_s"] = t.position_ned_m, t.velocity_ned_m_s
+            row["setpoint_gap_max_s"] = t.setpoint_gap_max_s
+        self._truth.append(rows)
+        self._at(self.now_ns + TRUTH_INTERVAL_NS, self._sample_truth)
+
+    def positions(self) -> dict[int, Ned]:
+        """True positions now (fleet frame, m)."""
+        return {i: v.autopilot.truth().position_ned_m for i, v in self.vehicles.items()}

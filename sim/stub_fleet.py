@@ -1,0 +1,63 @@
+"""The stub autopilots that a fleet.toml asks for."""
+
+from math import cos, pi, radians, sin
+from pathlib import Path
+from random import Random
+
+from companion.config import FleetConfig, autopilot_port, companion_port
+from companion.core.frames import Ned
+from sim.dynamics import DynamicsParameters, GustParameters, NoiseParameters
+from sim.stubs import StubFleetSettings, StubVehicleSettings
+
+LAND_ON_LOSS = 4
+FLEET_PARAMETERS: tuple[tuple[str, float | int], ...] = (
+    ("COM_OBL_RC_ACT", LAND_ON_LOSS),
+    ("COM_RC_OVERRIDE", 3),
+    ("NAV_RCL_ACT", 0),
+    ("COM_RCL_EXCEPT", 4),
+)
+"""PX4 parameters of a fleet without RC: land when the setpoints end; OFFBOARD needs no RC"""
+
+
+def stub_settings(
+    config: FleetConfig,
+    *,
+    seed: int,
+    truth_path: Path | None = None,
+    stop_fd: int | None = None,
+    grace_s: float = 0.0,
+) -> StubFleetSettings:
+    """Settings of the stubs; each estimator's origin lies elsewhere, by up to `stub.origin_scatter_m`, after `seed`."""
+    stub = config.stub
+    random = Random(f"origins/{seed}")
+    vehicles = []
+    for v in config.vehicles:
+        way, angle = stub.origin_scatter_m * random.random(), 2.0 * pi * random.random()
+        offset = Ned(way * cos(angle), way * sin(angle), 0.2 * stub.origin_scatter_m * (random.random() - 0.5))
+        vehicles.append(
+            StubVehicleSettings(
+                vehicle_id=v.id,
+                system_id=v.system_id,
+                autopilot_port=autopilot_port(v.instance),
+                companion_port=companion_port(v.instance),
+                home_ned_m=Ned(v.pad_north_m, v.pad_east_m, 0.0),
+                ekf_origin_offset_m=offset if config.fleet.frame == "global" else Ned(
+                    -v.pad_north_m, -v.pad_east_m, 0.0
+                ),
+                yaw_rad=radians(config.formation.heading_deg),
+                parameters=FLEET_PARAMETERS,
+            )
+        )  # fmt: skip
+    return StubFleetSettings(
+        vehicles=tuple(vehicles),
+        fleet_origin=config.origin,
+        dynamics=DynamicsParameters(
+            model=stub.dynamics, attitude_lag_s=stub.lag_s, drag_per_s=stub.drag_per_s
+        ),
+        gust=GustParameters(sigma_m_s2=stub.gust_m_s2),
+        noise=NoiseParameters(position_sigma_m=stub.position_noise_m, velocity_sigma_m_s=stub.velocity_noise_m_s),
+        seed=seed,
+        truth_path=truth_path,
+        stop_fd=stop_fd,
+        grace_s=grace_s,
+    )  # fmt: skip

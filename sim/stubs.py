@@ -1,0 +1,302 @@
+"""Process host of stand-in autopilots: N vehicles on UDP sockets of the loopback interface, and a recorder of truth.
+
+Autopilot i sends from its port to its companion's port from boot on, whoever is there, as PX4 does; it never sends
+elsewhere (measured: a client on any other port gets nothing).
+"""
+
+import errno
+import os
+import selectors
+import signal
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from companion.core.frames import Geodetic, Ned
+from companion.errors import CompanionError
+from sim.autopilot import NO_OFFSET, Autopilot
+from sim.dynamics import DynamicsParameters, GustParameters, NoiseParameters
+
+TRUTH_DTYPE = np.dtype(
+    [
+        ("time_unix_ns", "<i8"),
+        ("vehicle_id", "<u2"),
+        ("armed", "u1"),
+        ("landed_state", "u1"),
+        ("custom_mode", "<u4"),
+        ("position_ned_m", "<f8", (3,)),
+        ("velocity_ned_m_s", "<f4", (3,)),
+        ("setpoint_gap_max_s", "<f4"),
+    ]
+)
+"""one record of the truth file: UTC, the vehicle, MAV_LANDED_STATE, PX4's custom_mode, true motion in the fleet frame,
+longest time without a set-point while OFFBOARD flew. The file is these records and nothing else: np.fromfile reads it.
+"""
+TRUTH_INTERVAL_NS = 20_000_000
+FLUSH_INTERVAL_NS = 500_000_000
+AUTOPILOT_BASE_PORT = 14580
+COMPANION_BASE_PORT = 14540
+HIGH_AUTOPILOT_BASE_PORT = 25540
+HIGH_COMPANION_BASE_PORT = 24540
+PORTS_BELOW_GROUND_STATION = 10
+"""14550 is the ground station's, so the eleventh vehicle and those after it use the high ports"""
+RECEIVE_BUFFER_BYTES = 1 << 20
+
+
+def autopilot_port(index: int) -> int:
+    """UDP port that autopilot `index` (0-based) binds."""
+    return (AUTOPILOT_BASE_PORT if index < PORTS_BELOW_GROUND_STATION else HIGH_AUTOPILOT_BASE_PORT) + index
+
+
+def companion_port(index: int) -> int:
+    """UDP port that autopilot `index` (0-based) sends to."""
+    return (COMPANION_BASE_PORT if index < PORTS_BELOW_GROUND_STATION else HIGH_COMPANION_BASE_PORT) + index
+
+
+@dataclass(frozen=True, slots=True)
+class StubVehicleSettings:
+    """One stand-in autopilot."""
+
+    vehicle_id: int
+    """1..250, as in fleet.toml"""
+    system_id: int
+    """MAVLink system id, 1..255"""
+    autopilot_port: int
+    """UDP port it binds on 127.0.0.1"""
+    companion_port: int
+    """UDP port on 127.0.0.1 it sends to"""
+    home_ned_m: Ned
+    """true position at start, fleet frame"""
+    ekf_origin_offset_m: Ned = NO_OFFSET
+    """where its estimator's origin lies relative to home, fleet frame"""
+    yaw_rad: float = 0.0
+    """heading at start"""
+    parameters: tuple[tuple[str, float | int], ...] = ()
+    """PX4 parameters that differ from the default"""
+
+
+@dataclass(frozen=True, slots=True)
+class StubFleetSettings:
+    """All stand-in autopilots of one process."""
+
+    vehicles: tuple[StubVehicleSettings, ...]
+    fleet_origin: Geodetic
+    dynamics: DynamicsParameters = field(default_factory=DynamicsParameters)
+    gust: GustParameters = field(default_factory=GustParameters)
+    noise: NoiseParameters = field(default_factory=NoiseParameters)
+    seed: int = 0
+    truth_path: Path | None = None
+    """file of TRUTH_DTYPE records, appended to; None: not recorded"""
+    stop_fd: int | None = None
+    """a file descriptor whose end of file means that the launcher is gone; None: nobody to watch"""
+    grace_s: float = 0.0
+    """after a signal or the launcher's end the vehicles stay this long, so that a landing command still arrives"""
+
+
+class _TruthRecorder:
+    """Appends every vehicle's true state at 50 Hz."""
+
+    def __init__(self, path: Path) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._file = path.open("ab")
+        self._flushed_ns = 0
+
+    def write(self, vehicles: list[tuple[int, Autopilot]], utc_offset_ns: int, now_ns: int) -> None:
+        rows = np.zeros(len(vehicles), TRUTH_DTYPE)
+        for row, (vehicle_id, autopilot) in zip(rows, vehicles, strict=True):
+            state = autopilot.truth()
+            row["time_unix_ns"] = state.time_ns + utc_offset_ns
+            row["vehicle_id"] = vehicle_id
+            row["armed"] = state.armed
+            row["landed_state"] = state.landed_state
+            row["custom_mode"] = state.custom_mode
+            row["position_ned_m"] = state.position_ned_m
+            row["velocity_ned_m_s"] = state.velocity_ned_m_s
+            row["setpoint_gap_max_s"] = state.setpoint_gap_max_s
+        self._file.write(rows.tobytes())
+        if now_ns - self._flushed_ns >= FLUSH_INTERVAL_NS:
+            self._flushed_ns = now_ns
+            self._file.flush()
+
+    def close(self) -> None:
+        self._file.close()
+
+
+class _Link:
+    """One vehicle's socket."""
+
+    def __init__(self, settings: StubVehicleSettings, autopilot: Autopilot) -> None:
+        self.settings = settings
+        self.autopilot = autopilot
+        self.socket = _bind(settings)
+        self.remote = ("127.0.0.1", settings.companion_port)
+
+    def receive_all(self) -> None:
+        while True:
+            try:
+                datagram = self.socket.recv(65535)
+            except BlockingIOError:
+                return
+            except ConnectionRefusedError:
+                continue  # an earlier datagram found nobody listening
+            self.autopilot.receive(datagram, time.monotonic_ns())
+
+    def send_all(self, now_ns: int) -> None:
+        for datagram in self.autopilot.advance(now_ns):
+            # A full buffer or nobody listening loses the datagram, as UDP may.
+            with suppress(BlockingIOError, ConnectionRefusedError):
+                self.socket.sendto(datagram, self.remote)
+
+
+def _bind(settings: StubVehicleSettings) -> socket.socket:
+    link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        link.setblocking(False)
+        link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
+        link.bind(("127.0.0.1", settings.autopilot_port))
+    except OSError as error:
+        link.close()
+        reason = "is in use" if error.errno == errno.EADDRINUSE else f"cannot be bound ({error.strerror})"
+        raise CompanionError(
+            f"vehicle {settings.vehicle_id}: UDP port {settings.autopilot_port} of its autopilot {reason}"
+        ) from error
+    return link
+
+
+def build_autopilot(
+    settings: StubFleetSettings, vehicle: StubVehicleSettings, boot_ns: int, utc_offset_ns: int
+) -> Autopilot:
+    """The stand-in of one vehicle as the settings describe it."""
+    return Autopilot(
+        system_id=vehicle.system_id,
+        boot_ns=boot_ns,
+        utc_offset_ns=utc_offset_ns,
+        fleet_origin=settings.fleet_origin,
+        home_ned_m=vehicle.home_ned_m,
+        ekf_origin_offset_m=vehicle.ekf_origin_offset_m,
+        dynamics=settings.dynamics,
+        gust=settings.gust,
+        noise=settings.noise,
+        parameters=dict(vehicle.parameters),
+        yaw_rad=vehicle.yaw_rad,
+        seed=settings.seed,
+    )
+
+
+@contextmanager
+def _stop_pipe() -> Iterator[int]:
+    """A file descriptor that becomes readable on SIGTERM or SIGINT; the handlers are put back afterwards."""
+    if threading.current_thread() is not threading.main_thread():
+        reader, writer = os.pipe()
+        try:
+            yield reader
+        finally:
+            os.close(reader)
+            os.close(writer)
+        return
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    previous = {
+        number: signal.signal(number, lambda *_: os.write(writer, b"x")) for number in (signal.SIGTERM, signal.SIGINT)
+    }
+    try:
+        yield reader
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+        os.close(reader)
+        os.close(writer)
+
+
+def run_stubs(settings: StubFleetSettings) -> None:
+    """Runs the vehicles until SIGTERM, SIGINT or the end of `stop_fd`, and the grace after it.
+
+    Raises CompanionError that names vehicle and port when a port is taken. A second signal ends the grace.
+    """
+    boot_ns = time.monotonic_ns()
+    utc_offset_ns = time.time_ns() - time.monotonic_ns()
+    links: list[_Link] = []
+    recorder = None
+    try:
+        for vehicle in settings.vehicles:
+            links.append(_Link(vehicle, build_autopilot(settings, vehicle, boot_ns, utc_offset_ns)))
+        if settings.truth_path is not None:
+            recorder = _TruthRecorder(settings.truth_path)
+        with _stop_pipe() as signal_fd, selectors.DefaultSelector() as selector:
+            selector.register(signal_fd, selectors.EVENT_READ, None)
+            if settings.stop_fd is not None:
+                selector.register(settings.stop_fd, selectors.EVENT_READ, None)
+            for link in links:
+                selector.register(link.socket, selectors.EVENT_READ, link)
+            _serve(settings, links, selector, recorder, boot_ns, utc_offset_ns)
+    finally:
+        for link in links:
+            link.socket.close()
+        if recorder is not None:
+            recorder.close()
+
+
+def _serve(
+    settings: StubFleetSettings,
+    links: list[_Link],
+    selector: selectors.BaseSelector,
+    recorder: _TruthRecorder | None,
+    boot_ns: int,
+    utc_offset_ns: int,
+) -> None:
+    vehicles = [(link.settings.vehicle_id, link.autopilot) for link in links]
+    deadlines = [link.autopilot.next_deadline_ns() for link in links]
+    truth_due_ns = boot_ns + TRUTH_INTERVAL_NS
+    end_ns: int | None = None
+    while True:
+        now_ns = time.monotonic_ns()
+        if end_ns is not None and now_ns >= end_ns:
+            return
+        wake_ns = min(*deadlines, truth_due_ns)
+        if end_ns is not None:
+            wake_ns = min(wake_ns, end_ns)
+        for key, _ in selector.select(max(wake_ns - now_ns, 0) / 1e9):
+            if key.data is not None:
+                key.data.receive_all()
+            elif _is_over(key.fd, settings.stop_fd):
+                if key.fd == settings.stop_fd:
+                    selector.unregister(key.fd)
+                grace_ns = round(settings.grace_s * 1e9)
+                asked_again = end_ns is not None and key.fd != settings.stop_fd
+                end_ns = time.monotonic_ns() + (0 if asked_again else grace_ns)
+        now_ns = time.monotonic_ns()
+        for index, link in enumerate(links):
+            # One vehicle's answers wait for the grid; nothing is due more often than a step.
+            if now_ns >= deadlines[index] or link.autopilot.next_deadline_ns() <= now_ns:
+                link.send_all(now_ns)
+                deadlines[index] = link.autopilot.next_deadline_ns()
+        if now_ns >= truth_due_ns:
+            if recorder is not None:
+                for link in links:
+                    link.send_all(now_ns)
+                recorder.write(vehicles, utc_offset_ns, now_ns)
+            late = (now_ns - truth_due_ns) // TRUTH_INTERVAL_NS
+            truth_due_ns += (late + 1) * TRUTH_INTERVAL_NS
+
+
+def _is_over(fd: int, stop_fd: int | None) -> bool:
+    """A signal came, or the launcher's end of the pipe is closed."""
+    data = os.read(fd, 4096)
+    return not data if fd == stop_fd else True
+
+
+__all__ = [
+    "TRUTH_DTYPE",
+    "StubFleetSettings",
+    "StubVehicleSettings",
+    "autopilot_port",
+    "build_autopilot",
+    "companion_port",
+    "run_stubs",
+]
