@@ -546,7 +546,9 @@ class Agent:
         elif ap.custom_mode == Px4Mode.AUTO_LAND:
             self._land_seen = True
         elif self._land_seen:
-            self._happened(PhaseEvent.TAKEN_OVER, now)
+            # On disarming PX4 falls back to the mode before, which the heartbeat tells a second later.
+            if ap.custom_mode != Px4Mode.OFFBOARD:
+                self._happened(PhaseEvent.TAKEN_OVER, now)
         else:
             ap.set_mode(Px4Mode.AUTO_LAND)
 
@@ -638,8 +640,7 @@ class Agent:
             "battery_percent": self.autopilot.battery_percent,
             "configuration": self.config.shared_hash,
             "failsafes": list(self.failsafes),
-            "rejected": dict(
-                self.rejected + self.peers.rejected + self.link.counts + self.autopilot.counts + self.safety.counts
-            ),
+            "rejected": dict(self.rejected + self.peers.rejected + self.link.rejected + self.autopilot.counts),
+            "limited": dict(self.safety.counts),
             "motion": json.loads(encode_motion(self.programme.newest)),
         }

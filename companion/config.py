@@ -378,8 +378,8 @@ class FleetConfig(_Table):
         if nearest < self.spacing_min_m:
             raise ConfigError(
                 f"$.formation.spacing_m: {shape!r} needs at least {self.spacing_min_m:.2f} m "
-                f"(the larger of separation's range {self.r0_m:.2f} m and the safety radius {self.safety_radius_m:.2f} m, and "
-                f"{SPACING_MARGIN_M} m), got {nearest:.2f} m"
+                f"(the larger of separation's range {self.r0_m:.2f} m and the safety radius "
+                f"{self.safety_radius_m:.2f} m, and {SPACING_MARGIN_M} m), got {nearest:.2f} m"
             )
         if minimum_distance(slots, DOWNWASH_RATIO) < self.safety_radius_m + SPACING_MARGIN_M and self.limits.barrier:
             raise ConfigError(

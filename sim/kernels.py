@@ -23,13 +23,15 @@ from companion.core.hold import Weights
 from companion.core.intent import IntentGains, IntentTrigger
 from companion.core.law import Gains, Sums
 from companion.core.trigger import ErrorTrigger, SwitchingTrigger
+from sim.study import baselines
+from sim.study.baselines import CUT
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.uint8]
 F = TypeVar("F", bound=Callable[..., Any])
 
-_MODULES = (consensus, estimate, hold, intent, law, neighbours, safety, trigger)
+_MODULES = (baselines, consensus, estimate, hold, intent, law, neighbours, safety, trigger)
 
 
 def source_hash() -> str:
@@ -51,9 +53,7 @@ FAST = {"nsz", "contract", "reassoc", "arcp", "afn", "nnan"}
 
 def compiled(function: F, **names: Any) -> F:
     """A core function, compiled; `names` stand for the functions that it calls."""
-    bound = FunctionType(
-        function.__code__, {**function.__globals__, **names}, function.__name__, function.__defaults__
-    )
+    bound = FunctionType(function.__code__, {**function.__globals__, **names}, function.__name__, function.__defaults__)
     return cast(F, numba.njit(fastmath=FAST)(bound))
 
 
@@ -86,10 +86,13 @@ intent_rest = compiled(intent.rest, saturated=saturated)
 response = compiled(intent.response)
 anchor_axis = compiled(intent.anchor_axis)
 anchor_exceeds = compiled(intent.anchor_exceeds)
+classic_threshold = compiled(baselines.classic_threshold)
+elastic_threshold = compiled(baselines.elastic_threshold)
+observer_axis = compiled(baselines.observer_axis)
+other_separation = compiled(baselines.other_separation)
 
 HOLD_ZERO, HOLD_FIRST, HOLD_DAMPED, HOLD_OBSERVER = 0, 1, 2, 3
-ERROR, SWITCHING, PERIODIC, FLOAT_CLOCK, RELATIVE, ELASTIC, INTENT = 0, 1, 2, 3, 4, 5, 6
-CUT, GRADIENT, UNCUT = 0, 1, 2
+ERROR, SWITCHING, PERIODIC, FLOAT_CLOCK, CLASSIC, ELASTIC, INTENT = 0, 1, 2, 3, 4, 5, 6
 SAMPLE = 15
 """floats of a sample: flown law p, v, nu; published intent c, g, w, e, e'"""
 DIGEST = 16
@@ -193,6 +196,8 @@ class State(NamedTuple):
     """what the peers predict of this agent (N, 6), and its anchor (N, 9)"""
     residual: Floats
     """mean residual of the last control period (N, 3)"""
+    neighbours: Floats
+    """how many took part in it (N,)"""
     observed: Floats
     """observer of the elastic baseline (N, 6)"""
     predicted: Floats
@@ -361,9 +366,7 @@ def compose(i: int, k: int, s: State, ref: Floats, o: Options) -> None:
 
 
 @kernel
-def fires(
-    i: int, k: int, s: State, o: Options, et: ErrorTrigger, st: SwitchingTrigger, it: IntentTrigger
-) -> bool:
+def fires(i: int, k: int, s: State, o: Options, et: ErrorTrigger, st: SwitchingTrigger, it: IntentTrigger) -> bool:
     """Whether agent i's trigger asks for a message at step k; heartbeat and t_min come on top."""
     t = k * o.dt
     ep = 0.0
@@ -395,13 +398,11 @@ def fires(
             s.clock[i] = t
             return True
         return False
-    n = float(s.start[i + 1] - s.start[i])
-    # residual is the mean over neighbours: z_i = n times it
-    z2 = n * n * res
-    if kind == RELATIVE:
-        share = o.relative_sigma * o.relative_a * (1.0 - o.relative_a * n) / max(n, 1.0)
-        return ep + et.gamma_s2 * ev > share * z2
-    return ep + et.gamma_s2 * ev >= o.relative_sigma * res + o.elastic_epsilon * math.exp(-o.relative_a * t)
+    n = max(s.neighbours[i], 1.0)
+    # the residual is the mean over neighbours, so that z_i is n times it
+    if kind == CLASSIC:
+        return ep + et.gamma_s2 * ev > classic_threshold(n, n * n * res, o.relative_sigma, o.relative_a)
+    return ep + et.gamma_s2 * ev >= elastic_threshold(res, t, o.relative_sigma, o.relative_a, o.elastic_epsilon)
 
 
 @kernel
@@ -536,8 +537,9 @@ def predict_all(k: int, s: State, ref: Floats, o: Options, ig: IntentGains) -> N
                 for c in range(3):
                     if k == 0:
                         s.observed[j, c], s.observed[j, 3 + c] = s.sent[j, c], s.sent[j, 3 + c]
-                    s.observed[j, c] += dt * (s.observed[j, 3 + c] + o.observer_gain * (s.sent[j, c] - s.observed[j, c]))
-                    s.observed[j, 3 + c] += dt * o.observer_gain * (s.sent[j, 3 + c] - s.observed[j, 3 + c])
+                    s.observed[j, c], s.observed[j, 3 + c] = observer_axis(
+                        s.observed[j, c], s.observed[j, 3 + c], s.sent[j, c], s.sent[j, 3 + c], o.observer_gain, dt
+                    )
                     s.predicted[j, c], s.predicted[j, 3 + c] = s.observed[j, c], s.observed[j, 3 + c]
             else:
                 # what everyone predicts of j is what j's own trigger has just computed
@@ -564,20 +566,6 @@ def predict_all(k: int, s: State, ref: Floats, o: Options, ig: IntentGains) -> N
         if j == o.fault_agent and k == o.fault_step:
             for c in range(3):
                 s.stopped[e, c] = s.predicted[e, c]
-
-
-@kernel
-def extra_separation(kind: int, dx: float, dy: float, dz: float, g: Gains) -> tuple[float, float, float]:
-    """What other readings of phi_s add to law.pair's: its negative part beyond r0, or -grad phi_s instead."""
-    r = max(math.sqrt(dx * dx + dy * dy + dz * dz), law.DISTANCE_FLOOR_M)
-    cut = max(1.0 / (r * r) - 1.0 / (g.r0 * g.r0), 0.0)
-    if kind == UNCUT:
-        size = g.k_s * (1.0 / (r * r) - 1.0 / (g.r0 * g.r0) - cut) / r
-    elif kind == GRADIENT:
-        size = g.k_s * ((2.0 / (r * r * r) if r < g.r0 else 0.0) - cut) / r
-    else:
-        size = 0.0
-    return size * dx, size * dy, size * dz
 
 
 @kernel
@@ -656,7 +644,7 @@ def command(k: int, s: State, ref: Floats, o: Options, g: Gains, ig: IntentGains
             else:
                 sx, sy, sz = sx + q.sep_x, sy + q.sep_y, sz + q.sep_z
             if o.separation_kind != CUT:
-                f = extra_separation(o.separation_kind, dx, dy, dz, g)
+                f = other_separation(o.separation_kind, dx, dy, dz, g)
                 sx, sy, sz = sx + f[0], sy + f[1], sz + f[2]
             if not (lost or outlier):
                 n += 1.0
@@ -667,9 +655,7 @@ def command(k: int, s: State, ref: Floats, o: Options, g: Gains, ig: IntentGains
                 )  # fmt: skip
                 if o.leaderless == 1:
                     h = s.held[e] if o.links == 1 else s.sent[j]
-                    d0, d1, d2 = saturated(
-                        s.common[i, 0] - h[6], s.common[i, 1] - h[7], s.common[i, 2] - h[8], 1.0
-                    )
+                    d0, d1, d2 = saturated(s.common[i, 0] - h[6], s.common[i, 1] - h[7], s.common[i, 2] - h[8], 1.0)
                     nx, ny, nz = nx + d0, ny + d1, nz + d2
                 if o.intent == 1:
                     cx, cy, cz = s.anchor[i, 0] - row[9], s.anchor[i, 1] - row[10], s.anchor[i, 2] - row[11]
@@ -689,6 +675,7 @@ def command(k: int, s: State, ref: Floats, o: Options, g: Gains, ig: IntentGains
             d0, d1, d2 = common_velocity_rate(n, nx, ny, nz)
             nx, ny, nz = d0, d1, d2
         divisor = max(n, 1.0)
+        s.neighbours[i] = n
         if o.intent == 1:
             # residual of the anchors: what the trigger of this law looks at
             s.residual[i, 0], s.residual[i, 1], s.residual[i, 2] = qx / divisor, qy / divisor, qz / divisor
@@ -1031,10 +1018,6 @@ def largest_shift(x: Floats, then: Floats) -> float:
     m0, m1, m2 = m0 / n, m1 / n, m2 / n
     largest = 0.0
     for i in range(n):
-        d = (
-            (x[i, 0] - then[i, 0] - m0) ** 2
-            + (x[i, 1] - then[i, 1] - m1) ** 2
-            + (x[i, 2] - then[i, 2] - m2) ** 2
-        )
+        d = (x[i, 0] - then[i, 0] - m0) ** 2 + (x[i, 1] - then[i, 1] - m1) ** 2 + (x[i, 2] - then[i, 2] - m2) ** 2
         largest = max(largest, d)
     return math.sqrt(largest)

@@ -53,7 +53,7 @@ class Lockstep:
 
     config: FleetConfig
     seed: int = 0
-    network: NetworkParameters = NetworkParameters()
+    network: NetworkParameters = field(default_factory=NetworkParameters)
     record: Callable[[int, str, Instant, bytes], None] | None = None
     """called with every input and output of every agent: (vehicle id, channel, time, body)"""
     now_ns: int = 0

@@ -20,9 +20,9 @@ from sim.px4_parameters import ParameterTable
 
 WGS84_SEMI_MAJOR_M = 6_378_137.0
 WGS84_ECCENTRICITY_SQUARED = 6.69437999014e-3
-SENSORS_PRESENT = 0x0300402F | 1 << 28
-SENSORS_ENABLED = 0x0301402F | 1 << 28
-"""bit masks of MAV_SYS_STATUS_SENSOR as recorded, and the prearm bit (1 << 28), which mavsdk wants in all three"""
+SENSORS_PRESENT = 0x0300402F
+SENSORS_ENABLED = 0x0301402F
+"""bit masks of MAV_SYS_STATUS_SENSOR as recorded: the prearm bit (1 << 28) shows in the health mask alone"""
 SENSORS_HEALTHY = 0x0320C83F
 PREARM_CHECK = 1 << 28
 GPS_SENSOR = 1 << 5

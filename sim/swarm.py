@@ -56,6 +56,8 @@ class Formation:
     """v: step across the heading"""
     up_m: float = 0.0
     """v: step upward"""
+    open_m: float = 0.0
+    """v: distance between the two foremost vehicles of two equal arms; 0: one vehicle leads"""
     spacing_m: float = 1.5
     """named shapes and cloud: spacing; helix: arc between neighbours, seen from above"""
     radius_m: float = 3.0
@@ -70,9 +72,10 @@ class Formation:
         n = self.count
         if self.shape == "v":
             k = np.arange(n)
-            arm = (k + 1) // 2
+            arm = k // 2 if self.open_m > 0 else (k + 1) // 2
             side = np.where(k % 2 == 1, 1.0, -1.0)
-            d = np.stack([-self.along_m * arm, self.across_m * arm * side, -self.up_m * arm], axis=1)
+            y = (self.across_m * arm + self.open_m / 2) * side
+            d = np.stack([-self.along_m * arm, y, -self.up_m * arm], axis=1)
             if self.first_at_tips:
                 # arms listed one after the other, each from its tip inward
                 right = [i for i in reversed(range(n)) if i % 2 == 1]
@@ -275,7 +278,7 @@ def _filled(base: Any, values: Mapping[str, Any], where: str) -> Any:
         if get_origin(kind) is Literal and value not in get_args(kind):
             raise ConfigError(f"{where}.{name} must be one of {', '.join(get_args(kind))}, got {value!r}")
         if (kind is bool) != isinstance(value, bool) or (
-            kind in (int, float) and not isinstance(value, int | float) or (kind is int and not isinstance(value, int))
+            (kind in (int, float) and not isinstance(value, int | float)) or (kind is int and not isinstance(value, int))
         ):
             raise ConfigError(f"{where}.{name} must be {getattr(kind, '__name__', kind)}, got {value!r}")
     converted = {
@@ -541,7 +544,7 @@ def run(setup: Setup, seed: int, *, reference: Floats | None = None, start: tupl
         x=x, v=v, a=np.zeros((n, 3)), gust=np.zeros((n, 3)), bias=np.zeros((n, 3)), measured=np.zeros((n, 6)),
         filtered=np.zeros((n, 6)), u=np.zeros((n, 3)), common=np.zeros((n, 3)), anchor=np.zeros((n, 3)),
         anchor_speed=np.zeros((n, 3)), sent=np.zeros((n, loops.SAMPLE)), sent_step=np.full(n, -1, dtype=np.int64),
-        limit=np.zeros(n), clock=np.zeros(n), own=np.zeros((n, 12)), residual=np.zeros((n, 3)),
+        limit=np.zeros(n), clock=np.zeros(n), own=np.zeros((n, 12)), residual=np.zeros((n, 3)), neighbours=np.zeros(n),
         observed=np.zeros((n, 6)), predicted=np.zeros((rows, 12)),
         held=np.zeros((rows if o.links else 1, loops.SAMPLE)),
         held_step=np.full(rows if o.links else 1, -1, dtype=np.int64), stopped=np.zeros((rows, 3)),
@@ -565,9 +568,7 @@ def run(setup: Setup, seed: int, *, reference: Floats | None = None, start: tupl
         setup.saturation_m_s,
     )  # fmt: skip
     et = ErrorTrigger(setup.epsilon_m, setup.gamma_s2, setup.kappa)
-    st = SwitchingTrigger(
-        setup.gamma_s2, setup.alpha, setup.beta, setup.delta_min, setup.delta_f, setup.eta
-    )
+    st = SwitchingTrigger(setup.gamma_s2, setup.alpha, setup.beta, setup.delta_min, setup.delta_f, setup.eta)
     it = IntentTrigger(setup.intent_epsilon_m, setup.intent_kappa)
     if dense:
         loops.advance(0, steps, setup.keep_every, s, table, o, g, ig, et, st, it)

@@ -1,7 +1,7 @@
 """The peer table: what this vehicle knows of the others, and what that says about now."""
 
 from collections import Counter
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from math import dist, isfinite
 from statistics import median
 
@@ -282,5 +282,5 @@ def _gate(neighbours: list[Neighbour], ego: Ned) -> list[Neighbour]:
     for k, r_north, r_east in zip(taking_part, north, east, strict=True):
         v, slot = neighbours[k].velocity_ned_m_s, neighbours[k].reference_velocity_ned_m_s
         if is_outlier(v.north - slot.north, v.east - slot.east, r_north - middle_north, r_east - middle_east):
-            gated[k] = replace(neighbours[k], in_formation=False)
+            gated[k] = neighbours[k]._replace(in_formation=False)
     return gated

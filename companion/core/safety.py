@@ -321,10 +321,11 @@ def _within(a_north: float, a_east: float, b_north: float, b_east: float, most: 
 def _least_missing(planes: Sequence[HalfPlane], most: float) -> tuple[float, float]:
     """The command with norm up to `most` (m/s^2) that misses the half-planes least, by the largest miss of h'' + ..."""
     u = (0.0, 0.0)
+    weights = [0.0] * len(planes)
     low, high = 0.0, max(p.b for p in planes)
     for _ in range(RELAXATIONS):
         relaxed = 0.5 * (low + high)
-        north, east, met = nearest_feasible(0.0, 0.0, [p._replace(b=p.b - relaxed) for p in planes])
+        north, east, met = project(0.0, 0.0, [(g_n, g_e, b - relaxed) for g_n, g_e, b, _ in planes], weights)
         if met and hypot(north, east) <= most:
             u, high = (north, east), relaxed
         else:

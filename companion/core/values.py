@@ -77,8 +77,7 @@ class PeerMessage:
     """the sender's latest samples of others, newest first"""
 
 
-@dataclass(frozen=True, slots=True)
-class Neighbour:
+class Neighbour(NamedTuple):
     """A peer predicted to the present."""
 
     vehicle_id: int

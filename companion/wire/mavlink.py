@@ -144,7 +144,8 @@ class MavlinkLink:
 
     def __init__(self, system_id: int) -> None:
         self.system_id = system_id
-        self.counts: Counter[str] = Counter()
+        self.rejected: Counter[str] = Counter()
+        self.not_read = 0
         self._out: Any = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=COMPANION_COMPONENT_ID)
         self._in: Any = mavlink.MAVLink(None)
         self._in.robust_parsing = True
@@ -156,12 +157,12 @@ class MavlinkLink:
             message_id = datagram[7] | datagram[8] << 8 | datagram[9] << 16
             whole = len(datagram) == 12 + datagram[1] + (13 if datagram[2] & 1 else 0)
             if whole and message_id not in _READ:
-                self.counts["not read"] += 1
+                self.not_read += 1
                 return []
         errors = self._in.total_receive_errors
         messages = self._in.parse_buffer(datagram) or []
         if self._in.total_receive_errors > errors or not messages:
-            self.counts["malformed"] += 1
+            self.rejected["malformed"] += 1
             self._in.buf.clear()
             self._in.buf_index = 0
         events = []
@@ -175,13 +176,13 @@ class MavlinkLink:
         if isinstance(message, mavlink.MAVLink_bad_data):
             return None
         if message.get_srcSystem() != self.system_id or message.get_srcComponent() != AUTOPILOT_COMPONENT_ID:
-            self.counts["foreign system"] += 1
+            self.rejected["foreign system"] += 1
             return None
         match message:
             case mavlink.MAVLink_local_position_ned_message():
                 numbers = (message.x, message.y, message.z, message.vx, message.vy, message.vz)
                 if not all(isfinite(x) for x in numbers):
-                    self.counts["not finite"] += 1
+                    self.rejected["not finite"] += 1
                     return None
                 return LocalPosition(message.time_boot_ms, Ned(*numbers[:3]), Ned(*numbers[3:]))
             case mavlink.MAVLink_heartbeat_message():
@@ -208,7 +209,7 @@ class MavlinkLink:
                 return CommandAnswer(message.command, message.result)
             case mavlink.MAVLink_param_value_message():
                 return Parameter(message.param_id.rstrip("\x00"), parameter_value(message))
-        self.counts["not read"] += 1
+        self.not_read += 1
         return None
 
     def heartbeat(self) -> bytes:

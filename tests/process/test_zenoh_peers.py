@@ -325,11 +325,13 @@ def test_an_endpoint_in_use_is_an_error_with_a_sentence(fleet: str, tmp_path: Pa
 @pytest.mark.process
 def test_foreign_keys_deletions_and_oversized_payloads_are_counted_and_not_delivered(fleet: str) -> None:
     with vehicle(fleet, 1) as one, zenoh.open(zenoh_configuration(PeerNetworkSettings(fleet, None))) as stranger:
+        block = zenoh.CongestionControl.BLOCK
+        assert eventually(lambda: len(list(stranger.liveliness().get("fleet/1/alive"))) == 1)
         for name in ("abc", "0", "007", "251", "-2", "2.0", "1e1", "²"):
-            stranger.put(f"fleet/{name}/state", b"x")
-        stranger.delete("fleet/2/state")
-        stranger.put("fleet/2/state", bytes(PAYLOAD_MAX_BYTES + 1))
-        stranger.put("fleet/2/state", b"good")
+            stranger.put(f"fleet/{name}/state", b"x", congestion_control=block)
+        stranger.delete("fleet/2/state", congestion_control=block)
+        stranger.put("fleet/2/state", bytes(PAYLOAD_MAX_BYTES + 1), congestion_control=block)
+        stranger.put("fleet/2/state", b"good", congestion_control=block)
         one.wait_message("fleet/2/state", b"good")
         assert one.messages() == [("fleet/2/state", b"good")]
         assert one.network.counters.malformed == 10
@@ -356,13 +358,13 @@ def test_somebody_else_speaking_under_our_id_is_counted_and_not_delivered(fleet:
 
 @pytest.mark.process
 def test_a_loop_that_does_not_drain_keeps_the_newest_messages_and_every_presence(fleet: str) -> None:
-    with vehicle(fleet, 1, queue_capacity=8) as one, vehicle(fleet, 2) as two:
+    with vehicle(fleet, 1, queue_capacity=4) as one, vehicle(fleet, 2) as two:
         two.wait_presence(1, True)
-        for number in range(50):
+        for number in range(12):
             two.network.publish("plan", b"%d" % number)
-        assert eventually(lambda: one.network.dropped == 42)
-        one.wait_message("fleet/2/plan", b"49")
-        assert one.messages() == [("fleet/2/plan", b"%d" % number) for number in range(42, 50)]
+        assert eventually(lambda: one.network.dropped == 8)
+        one.wait_message("fleet/2/plan", b"11")
+        assert one.messages() == [("fleet/2/plan", b"%d" % number) for number in range(8, 12)]
         assert one.presence() == [(2, True)]
 
 

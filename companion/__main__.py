@@ -1,0 +1,74 @@
+"""Command `companion`: one vehicle's companion process."""
+
+import sys
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from companion.config import load
+from companion.errors import CompanionError
+
+app = typer.Typer(
+    no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, help="One vehicle's companion process."
+)
+USAGE_ERROR = 2
+DIFFERENT = 1
+
+
+@app.command()
+def run(
+    vehicle: Annotated[int, typer.Option(min=1, max=250, help="This vehicle's id in fleet.toml.")],
+    fleet: Annotated[Path, typer.Option(help="The fleet's configuration.")] = Path("fleet.toml"),
+    record: Annotated[Path | None, typer.Option(help="MCAP file for every input and output.")] = None,
+    launched: Annotated[
+        bool, typer.Option("--launched", help="End (and land) when standard input closes: for launchers.")
+    ] = False,
+) -> None:
+    """Fly one vehicle: read its autopilot, hear and tell its peers, send setpoints. Ctrl-C lands it and ends.
+
+    Exit status: 0 ended with the vehicle landed or landing, 2 wrong usage or configuration, 3 ended while the autopilot
+    had not confirmed landing.
+    """
+    from companion.io.loop import Companion, RunSettings
+
+    def log(text: str) -> None:
+        print(f"vehicle {vehicle}: {text}", flush=True)  # noqa: T201 - the process's log
+
+    config = load(fleet)
+    settings = RunSettings(vehicle, record, sys.stdin.fileno() if launched else None, log)
+    companion = Companion(config, settings, {"config": fleet.read_text(), "version": version("starling-fleet")})
+    try:
+        status = companion.run()
+    finally:
+        companion.close()
+    raise typer.Exit(status)
+
+
+@app.command()
+def replay(
+    file: Annotated[Path, typer.Argument(help="A companion's recording (MCAP).")],
+) -> None:
+    """Run the agent on a recording's inputs and compare its outputs byte for byte.
+
+    Exit status: 0 the same, 1 different (the first difference is shown), 2 not a recording.
+    """
+    from companion.replay import replay_file
+
+    result = replay_file(file)
+    typer.echo(result.sentence())
+    raise typer.Exit(0 if result.same else DIFFERENT)
+
+
+def main() -> None:
+    """Entry point: errors that a user can act on end with a sentence, not a traceback."""
+    try:
+        app(standalone_mode=True)
+    except CompanionError as error:
+        typer.echo(f"companion: {error}", err=True)
+        raise SystemExit(USAGE_ERROR) from None
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,255 @@
+"""The companion process: one loop around one Agent.
+
+It waits for the autopilot's datagrams, the peers' messages, the operator's requests and the next deadline, hands them
+to the agent with their times, and sends what the agent answers. Setpoints go out right after the position that they
+follow from; what can wait (records, replies) is done after them.
+"""
+
+import gc
+import json
+import os
+import secrets
+import select
+import signal
+import socket
+import struct
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from companion.agent import Agent, Outputs
+from companion.config import FleetConfig, udp_endpoint
+from companion.core.values import Instant
+from companion.errors import CompanionError
+from companion.io.clock import FleetClock
+from companion.io.link import UdpLink
+from companion.io.recorder import Recorder
+from companion.io.traffic import tcp_bytes_sent
+from companion.io.zenoh_peers import PeerMessage, PeerNetwork, PeerNetworkSettings, PresenceChange, Request
+
+TICK_RECORD = struct.Struct("<qqqff?")
+"""body of the "tick" channel: lateness ns, sensor-to-setpoint latency ns (-1 for a timer's tick), process CPU ns,
+position error m, nearest neighbour m, whether a setpoint was sent"""
+TRAFFIC_RECORD = struct.Struct("<q")
+"""body of the "traffic" channel: bytes that this process's TCP connections have sent so far"""
+LANDING_GRACE_S = 3.0
+"""how long an ending companion waits for its autopilot to confirm landing"""
+ABANDONED_GRACE_S = 1.2
+"""the same when whoever launched it is gone"""
+
+
+@dataclass(frozen=True, slots=True)
+class RunSettings:
+    """How to run one companion."""
+
+    vehicle_id: int
+    record: Path | None = None
+    """MCAP file for every input and output"""
+    stop_fd: int | None = None
+    """a file descriptor whose end of file means that the launcher is gone"""
+    log: Callable[[str], None] = print
+
+
+def network_settings(config: FleetConfig, vehicle_id: int | None) -> PeerNetworkSettings:
+    """The Zenoh session of a vehicle, or of an operator's client (None)."""
+    listen: tuple[str, ...] = ()
+    own = None if vehicle_id is None else config.by_id(vehicle_id).zenoh
+    if own is not None:
+        listen = (own,)
+    connect = tuple(v.zenoh for v in config.vehicles if v.zenoh is not None and v.id != vehicle_id)
+    return PeerNetworkSettings(
+        fleet_name=config.fleet.name,
+        vehicle_id=vehicle_id,
+        profile=config.peers.network,
+        listen=listen,
+        connect=connect,
+        scouting_port=config.peers.scouting_port,
+    )
+
+
+@contextmanager
+def _signals(stop: Callable[[], None]) -> Iterator[None]:
+    previous = {s: signal.signal(s, lambda *_: stop()) for s in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        yield
+    finally:
+        for s, handler in previous.items():
+            signal.signal(s, handler)
+
+
+class Companion:
+    """One companion's resources and its loop."""
+
+    def __init__(self, config: FleetConfig, settings: RunSettings, metadata: dict[str, str]) -> None:
+        self.settings = settings
+        self.boot_id = secrets.randbits(32)
+        self.agent = Agent(config, settings.vehicle_id, self.boot_id)
+        self.clock = FleetClock()
+        self._wake_read, self._wake_write = socket.socketpair()
+        self._wake_read.setblocking(False)
+        self._wake_write.setblocking(False)
+        self._resources = ExitStack()
+        self._resources.callback(self._wake_read.close)
+        self._resources.callback(self._wake_write.close)
+        try:
+            endpoint = udp_endpoint(self.agent.vehicle.mavlink)
+            if endpoint is None:
+                raise CompanionError(f"link {self.agent.vehicle.mavlink!r} is not supported yet; use udp://HOST:PORT")
+            self.link = UdpLink(*endpoint)
+            self._resources.callback(self.link.close)
+            self.recorder: Recorder | None = None
+            if settings.record is not None:
+                facts = {**metadata, "vehicle_id": str(settings.vehicle_id), "boot_id": str(self.boot_id)}
+                self.recorder = Recorder(settings.record, facts)
+                self._resources.callback(self.recorder.close)
+            self.network = PeerNetwork(network_settings(config, settings.vehicle_id), self._wake)
+            self._resources.callback(self.network.close)
+            self.network.open()
+        except BaseException:
+            self._resources.close()
+            raise
+        self._stop_by_ns: int | None = None
+        self._last_ns = 0
+        self._second_ns = 0
+        self._driver_ns: int | None = None
+        """when the position that the next tick follows from was received"""
+        self.lateness_ns = 0
+
+    def _wake(self) -> None:
+        with suppress(OSError):  # full: the loop wakes anyway; closed: it has ended
+            self._wake_write.send(b"\0")
+
+    def close(self) -> None:
+        """Release everything, the Zenoh session first."""
+        self._resources.close()
+
+    def stop(self, grace_s: float = LANDING_GRACE_S) -> None:
+        """Land, and end once the autopilot has taken over or the grace is over."""
+        if self._stop_by_ns is None:
+            now = self._instant(time.monotonic_ns())
+            self._record("input/stop", now, b"")
+            self.agent.stop(now)
+            self._stop_by_ns = now.monotonic_ns + round(grace_s * 1e9)
+        else:
+            self._stop_by_ns = 0
+
+    def run(self) -> int:
+        """Run until stopped; 0 if the vehicle was safe then, 3 if it still flew without a confirmed landing."""
+        asked: list[bool] = []
+        waiting: list[Any] = [self.link, self._wake_read]
+        if self.settings.stop_fd is not None:
+            waiting.append(self.settings.stop_fd)
+
+        def ask() -> None:
+            asked.append(True)
+            self._wake()
+
+        gc.collect()
+        gc.freeze()
+        sys.setswitchinterval(0.0005)
+        with _signals(ask):
+            while True:
+                deadline_ns = min(self.agent.next_deadline_ns(), self._second_ns)
+                ready, _, _ = select.select(waiting, [], [], max(deadline_ns - time.monotonic_ns(), 0) * 1e-9)
+                requests = self._receive(ready)
+                if asked:
+                    asked.pop()
+                    self.stop()
+                if self.settings.stop_fd in ready and not os.read(self.settings.stop_fd, 4096):
+                    waiting.remove(self.settings.stop_fd)
+                    self.stop(ABANDONED_GRACE_S)
+                self._advance(deadline_ns)
+                for request in requests:
+                    self._reply(request)
+                now_ns = time.monotonic_ns()
+                if now_ns >= self._second_ns:
+                    self._each_second(now_ns)
+                if self._stop_by_ns is not None and (self.agent.stopped or now_ns >= self._stop_by_ns):
+                    return 0 if self.agent.stopped else 3
+
+    def _instant(self, monotonic_ns: int) -> Instant:
+        """Times handed to the agent never go back, though the kernel's stamps may by a little."""
+        self._last_ns = max(self._last_ns, monotonic_ns)
+        return self.clock.at(self._last_ns)
+
+    def _record(self, channel: str, now: Instant, body: bytes) -> None:
+        if self.recorder is not None:
+            self.recorder.record(channel, now, body)
+
+    def _receive(self, ready: list[Any]) -> list[Request]:
+        if self.link in ready:
+            for datagram, received_ns in self.link.receive():
+                now = self._instant(received_ns)
+                self._record("input/mavlink", now, datagram)
+                self.agent.receive_mavlink(datagram, now)
+                if self._driver_ns is None and self.agent.next_deadline_ns() == 0:
+                    self._driver_ns = received_ns
+        if self._wake_read in ready:
+            self._wake_read.recv(4096)
+        requests = []
+        for event in self.network.drain():
+            now = self._instant(event.received_monotonic_ns)
+            match event:
+                case PeerMessage():
+                    self._record("input/peer", now, event.key.encode() + b"\0" + event.payload)
+                    self.agent.receive_peer(event.key, event.payload, now)
+                case PresenceChange():
+                    self._record("input/presence", now, bytes((event.vehicle_id, event.alive)))
+                    self.agent.receive_presence(event.vehicle_id, event.alive, now)
+                case Request():
+                    requests.append(event)
+        return requests
+
+    def _advance(self, deadline_ns: int) -> None:
+        if self.agent.next_deadline_ns() > time.monotonic_ns():
+            return
+        now = self._instant(time.monotonic_ns())
+        self._record("advance", now, b"")
+        out = self.agent.advance(now)
+        for datagram in out.mavlink:
+            self.link.send(datagram)
+        sent_ns = time.monotonic_ns()
+        for topic, payload in out.peers:
+            self.network.publish(topic, payload)
+        self._after(out, now, sent_ns, deadline_ns)
+
+    def _after(self, out: Outputs, now: Instant, sent_ns: int, deadline_ns: int) -> None:
+        for datagram in out.mavlink:
+            self._record("output/mavlink", now, datagram)
+        for topic, payload in out.peers:
+            self._record("output/peer", now, topic.encode() + b"\0" + payload)
+        for note in out.notes:
+            self._record("note", now, note.encode())
+            self.settings.log(note)
+        driver_ns, self._driver_ns = self._driver_ns, None
+        if out.tick is not None:
+            latency_ns = -1 if driver_ns is None else sent_ns - driver_ns
+            self.lateness_ns = sent_ns - deadline_ns if driver_ns is None else latency_ns
+            tick = out.tick
+            self._record("tick", now, TICK_RECORD.pack(
+                self.lateness_ns, latency_ns, time.process_time_ns(), tick.position_error_m, tick.nearest_m,
+                bool(out.mavlink),
+            ))  # fmt: skip
+
+    def _reply(self, request: Request) -> None:
+        now = self._instant(time.monotonic_ns())
+        if request.kind == "command":
+            self._record("input/command", now, request.payload)
+            request.reply(self.agent.receive_command(request.payload, now))
+            return
+        status = self.agent.status(now)
+        counters = self.network.counters
+        status["lateness_ms"] = self.lateness_ns * 1e-6
+        status["dropped"] = counters.dropped
+        status["recorder_lost"] = 0 if self.recorder is None else self.recorder.lost
+        status["rejected"]["peer: malformed key"] = counters.malformed
+        request.reply(json.dumps(status).encode())
+
+    def _each_second(self, now_ns: int) -> None:
+        self._second_ns = now_ns + 1_000_000_000
+        self.clock.discipline(latched=self.agent.autopilot.armed)
+        self._record("traffic", self._instant(now_ns), TRAFFIC_RECORD.pack(tcp_bytes_sent()))

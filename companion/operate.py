@@ -1,0 +1,152 @@
+"""The operator's side of a fleet: questions and commands to every vehicle, each acknowledged or named as silent.
+
+The operator is no leader: a command is a new motion (or a verb), the same bytes to every vehicle, and each vehicle
+decides for itself whether it takes it.
+"""
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from math import pi, radians
+from typing import Any, Protocol
+
+from companion.config import FleetConfig
+from companion.core.frames import Ned
+from companion.core.plan import GotoLeg, Leg, Motion, TurnLeg, VelocityLeg, goto_duration_s, with_formation, with_legs
+from companion.core.values import ZERO
+from companion.errors import RefusedError, WireError
+from companion.wire.peer import decode_motion, encode_motion
+
+COMMAND_LEAD_NS = 2_000_000_000
+"""how far ahead of now a commanded motion starts, so that every vehicle has it by then"""
+ANSWER_TIMEOUT_S = 5.0
+STATUS_TIMEOUT_S = 1.0
+RETRY_S = 0.5
+
+
+class Link(Protocol):
+    """How questions reach the vehicles (`io.zenoh_peers.OperatorLink`)."""
+
+    def ask(
+        self, vehicle_ids: Iterable[int], kind: str, payload: bytes, timeout_s: float, retry_s: float
+    ) -> dict[int, bytes | None]:
+        """Answers by vehicle id, None from the silent."""
+
+
+@dataclass(frozen=True, slots=True)
+class Answers:
+    """What the vehicles said to a command."""
+
+    accepted: tuple[int, ...]
+    refused: Mapping[int, str]
+    """vehicle id -> its reason"""
+    silent: tuple[int, ...]
+
+    @property
+    def all_accepted(self) -> bool:
+        """Whether every vehicle took it."""
+        return not self.refused and not self.silent
+
+    def sentence(self, verb: str) -> str:
+        """For people: who took it, who refused and why, who is silent."""
+        parts = [f"{verb}: accepted by {len(self.accepted)}"]
+        parts += [f"vehicle {i} refused: {reason}" for i, reason in sorted(self.refused.items())]
+        if self.silent:
+            parts.append(f"silent: vehicle {', '.join(str(i) for i in self.silent)}")
+        return "; ".join(parts)
+
+
+class Operator:
+    """Commands to a running fleet."""
+
+    def __init__(self, config: FleetConfig, link: Link) -> None:
+        self.config = config
+        self.link = link
+        self.ids = tuple(v.id for v in config.vehicles)
+
+    def status(self, timeout_s: float = STATUS_TIMEOUT_S) -> dict[int, dict[str, Any] | None]:
+        """Each vehicle's own account of itself; None from the silent."""
+        answers = self.link.ask(self.ids, "status", b"", timeout_s, RETRY_S)
+        return {i: None if a is None else json.loads(a) for i, a in answers.items()}
+
+    def command(self, verb: str, **more: object) -> Answers:
+        """A verb to every vehicle, asked again until each has answered or the time is over."""
+        payload = json.dumps({"verb": verb, **more}).encode()
+        accepted, refused, silent = [], {}, []
+        for i, answer in self.link.ask(self.ids, "command", payload, ANSWER_TIMEOUT_S, RETRY_S).items():
+            if answer is None:
+                silent.append(i)
+            elif (said := json.loads(answer))["accepted"]:
+                accepted.append(i)
+            else:
+                refused[i] = said["reason"]
+        return Answers(tuple(accepted), refused, tuple(silent))
+
+    def take_off(self) -> Answers:
+        """Every vehicle arms and climbs; refused by a vehicle that is not ready, with its reasons."""
+        return self.command("takeoff")
+
+    def land(self) -> Answers:
+        """Every vehicle lands where it is."""
+        return self.command("land")
+
+    def form(self, shape: str, now_ns: int) -> Answers:
+        """Another formation; RefusedError if nobody says where the fleet is, ConfigError for an unknown shape."""
+        slots = self.config.slots(shape)
+        newest = self._newest()
+        if newest.revision == 0 and newest.shape == "pads" and self.config.plan.automatic:
+            raise RefusedError("the fleet is not in formation yet")
+        motion = with_formation(
+            newest, at_ns=self._start_ns(newest, now_ns), issuer=0, shape=shape, slots=slots,
+            pinned=self.config.pinned, speed_m_s=self.config.limits.speed_max_m_s / 2,
+        )  # fmt: skip
+        return self._send(motion)
+
+    def move(self, leg: Leg, now_ns: int) -> Answers:
+        """Another motion of the formation."""
+        newest = self._newest()
+        return self._send(with_legs(newest, at_ns=self._start_ns(newest, now_ns), issuer=0, legs=(leg,)))
+
+    def goto(self, north_m: float, east_m: float, altitude_m: float | None, speed_m_s: float, now_ns: int) -> Answers:
+        """Fly the formation's centre to a point of the fleet frame and stop there."""
+        newest = self._newest()
+        start_ns = self._start_ns(newest, now_ns)
+        here = newest.moment(start_ns).centre.position
+        target = Ned(north_m, east_m, here.down if altitude_m is None else -altitude_m)
+        way = sum((a - b) ** 2 for a, b in zip(here, target, strict=True)) ** 0.5
+        leg = GotoLeg(target, goto_duration_s(way, speed_m_s))
+        return self._send(with_legs(newest, at_ns=start_ns, issuer=0, legs=(leg,)))
+
+    def hold(self, now_ns: int) -> Answers:
+        """Stop where the formation is."""
+        return self.move(VelocityLeg(ZERO, 0.0), now_ns)
+
+    def _newest(self) -> Motion:
+        motions = []
+        for said in self.status().values():
+            if said is not None:
+                try:
+                    motions.append(decode_motion(json.dumps(said["motion"]).encode()))
+                except WireError as error:
+                    raise RefusedError(
+                        f"vehicle {said['vehicle']} tells a plan that cannot be read: {error}"
+                    ) from error
+        if not motions:
+            raise RefusedError("no vehicle answers; is the fleet up, and is this its fleet.toml?")
+        return max(motions, key=lambda m: m.order)
+
+    def _start_ns(self, newest: Motion, now_ns: int) -> int:
+        return max(now_ns + COMMAND_LEAD_NS, newest.start_ns + 1)
+
+    def _send(self, motion: Motion) -> Answers:
+        return self.command("motion", motion=json.loads(encode_motion(motion)))
+
+
+def velocity_leg(north_m_s: float, east_m_s: float, up_m_s: float) -> VelocityLeg:
+    """Constant velocity until told otherwise."""
+    return VelocityLeg(Ned(north_m_s, east_m_s, -up_m_s), 0.0)
+
+
+def turn_leg(rate_deg_s: float, angle_deg: float | None) -> TurnLeg:
+    """A turn through an angle, or circling (None)."""
+    return TurnLeg(radians(rate_deg_s), float("inf") if angle_deg is None else angle_deg * pi / 180.0)

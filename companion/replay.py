@@ -1,0 +1,121 @@
+"""Replay: the agent on recorded inputs, its outputs compared with the recorded ones."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from companion.agent import Agent
+from companion.config import parse
+from companion.core.values import Instant
+from companion.errors import CompanionError
+from companion.io.recorder import Entry, read_recording
+
+OUTPUTS = ("output/mavlink", "output/peer")
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayResult:
+    """How a replay went."""
+
+    inputs: int
+    outputs: int
+    difference: str | None
+    """the first one, or None"""
+
+    @property
+    def same(self) -> bool:
+        """Whether every output was the recorded one."""
+        return self.difference is None
+
+    def sentence(self) -> str:
+        """For people."""
+        head = f"{self.inputs} inputs, {self.outputs} outputs compared byte for byte"
+        return f"{head}: the same" if self.same else f"{head}: first difference: {self.difference}"
+
+
+def replay_file(path: Path) -> ReplayResult:
+    """Replay one recording; CompanionError if the file is none."""
+    import tomllib
+
+    recording = read_recording(path)
+    try:
+        facts = recording.metadata
+        config = parse(tomllib.loads(facts["config"]), path.name)
+        agent = Agent(config, int(facts["vehicle_id"]), int(facts["boot_id"]))
+    except KeyError as missing:
+        raise CompanionError(f"{path}: is no companion's recording: {missing} is missing") from None
+    return replay(agent, recording.entries)
+
+
+def replay(agent: Agent, entries: Iterator[Entry]) -> ReplayResult:
+    """Feed an agent recorded inputs; stops at the first output that differs."""
+    expected: list[tuple[str, bytes]] = []
+    inputs = outputs = 0
+    for entry in entries:
+        if entry.channel in OUTPUTS:
+            outputs += 1
+            if not expected:
+                return ReplayResult(inputs, outputs, f"{_at(entry)}: recorded {entry.channel}, replayed nothing")
+            channel, body = expected.pop(0)
+            if (channel, body) != (entry.channel, entry.body):
+                return ReplayResult(
+                    inputs, outputs, f"{_at(entry)}: recorded {entry.channel} {entry.body.hex()}, "
+                    f"replayed {channel} {body.hex()}"
+                )  # fmt: skip
+            continue
+        if entry.channel not in INPUTS:
+            continue
+        if expected:
+            channel, body = expected[0]
+            return ReplayResult(inputs, outputs, f"{_at(entry)}: replayed {channel} {body.hex()}, recorded nothing")
+        inputs += 1
+        expected = list(INPUTS[entry.channel](agent, entry.body, entry.instant))
+    return ReplayResult(inputs, outputs, None)
+
+
+def _at(entry: Entry) -> str:
+    return f"monotonic {entry.instant.monotonic_ns * 1e-9:.6f} s"
+
+
+def _advance(agent: Agent, _: bytes, now: Instant) -> Iterator[tuple[str, bytes]]:
+    out = agent.advance(now)
+    for datagram in out.mavlink:
+        yield "output/mavlink", datagram
+    for topic, payload in out.peers:
+        yield "output/peer", topic.encode() + b"\0" + payload
+
+
+def _mavlink(agent: Agent, body: bytes, now: Instant) -> Iterator[tuple[str, bytes]]:
+    agent.receive_mavlink(body, now)
+    return iter(())
+
+
+def _peer(agent: Agent, body: bytes, now: Instant) -> Iterator[tuple[str, bytes]]:
+    key, _, payload = body.partition(b"\0")
+    agent.receive_peer(key.decode(), payload, now)
+    return iter(())
+
+
+def _presence(agent: Agent, body: bytes, now: Instant) -> Iterator[tuple[str, bytes]]:
+    agent.receive_presence(body[0], bool(body[1]), now)
+    return iter(())
+
+
+def _command(agent: Agent, body: bytes, now: Instant) -> Iterator[tuple[str, bytes]]:
+    agent.receive_command(body, now)
+    return iter(())
+
+
+def _stop(agent: Agent, _: bytes, now: Instant) -> Iterator[tuple[str, bytes]]:
+    agent.stop(now)
+    return iter(())
+
+
+INPUTS = {
+    "advance": _advance,
+    "input/mavlink": _mavlink,
+    "input/peer": _peer,
+    "input/presence": _presence,
+    "input/command": _command,
+    "input/stop": _stop,
+}

@@ -1,0 +1,291 @@
+"""Command `fleet`: a whole fleet on one machine, and the operator's verbs."""
+
+import json
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from companion.config import read_tables
+from companion.errors import CompanionError, ConfigError
+
+app = typer.Typer(
+    no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
+    help="A fleet of PX4 vehicles or of stubs: fly it, ask it, command it.",
+)  # fmt: skip
+FAILED = 1
+USAGE_ERROR = 2
+
+FleetFile = Annotated[Path, typer.Option("--fleet", help="The fleet's configuration.")]
+Vehicles = Annotated[int | None, typer.Option(min=1, max=250, help="Fly this many, whatever the file lists.")]
+DEFAULT_FILE = Path("fleet.toml")
+
+
+def _default_file(path: Path) -> Path:
+    """fleet.toml of this folder, or the one beside the packages when this folder has none."""
+    shipped = Path(__file__).resolve().parent.parent / "fleet.toml"
+    return shipped if path == DEFAULT_FILE and not path.exists() and shipped.exists() else path
+
+
+def _resize(tables: dict[str, Any], count: int) -> None:
+    """The first `count` vehicles of the file, and new ones after the last."""
+    listed = tables.get("vehicle", [])
+    taken = {v.get("id") for v in listed}
+    free = (i for i in range(1, 251) if i not in taken)
+    tables["vehicle"] = [*listed[:count], *({"id": next(free)} for _ in range(count - len(listed)))]
+
+
+def _tables(
+    path: Path, vehicles: int | None = None, formation: str | None = None, plan: str | None = None
+) -> dict[str, Any]:
+    def change(tables: dict[str, Any]) -> None:
+        if vehicles is not None:
+            _resize(tables, vehicles)
+        if formation is not None:
+            tables.setdefault("formation", {})["shape"] = formation
+        if plan is not None:
+            tables.setdefault("plan", {})["legs"] = plan_legs(plan)
+
+    return read_tables(_default_file(path), change)
+
+
+def plan_legs(text: str) -> list[dict[str, Any]]:
+    """Legs from the command line: `hold:10,velocity:1:0:20,turn:6:90,goto:40:0:1.5`, or `none`.
+
+    hold:SECONDS  velocity:NORTH:EAST:SECONDS (m/s)  turn:DEG_PER_S[:DEG]  goto:NORTH:EAST[:M_PER_S] (m)
+    """
+    names = {
+        "hold": ("duration_s",),
+        "velocity": ("north_m_s", "east_m_s", "duration_s"),
+        "turn": ("rate_deg_s", "angle_deg"),
+        "goto": ("north_m", "east_m", "speed_m_s"),
+    }
+    optional = {"angle_deg", "speed_m_s"}
+    legs: list[dict[str, Any]] = []
+    for part in [] if text == "none" else text.split(","):
+        kind, *values = part.split(":")
+        fields = names.get(kind)
+        form = "hold:S, velocity:N:E:S, turn:DEG_S[:DEG], goto:N:E[:M_S] or none"
+        if fields is None:
+            raise ConfigError(f"--plan: leg {part!r} must be one of {form}")
+        required = [f for f in fields if f not in optional]
+        if not len(required) <= len(values) <= len(fields):
+            raise ConfigError(f"--plan: leg {part!r} must be {form}")
+        try:
+            numbers = [float(v) for v in values]
+        except ValueError:
+            raise ConfigError(f"--plan: leg {part!r} must have numbers after its kind ({form})") from None
+        legs.append({"kind": kind, **dict(zip(fields, numbers, strict=False))})
+    return legs
+
+
+@app.command()
+def up(
+    vehicles: Vehicles = None,
+    fleet: FleetFile = DEFAULT_FILE,
+    formation: Annotated[str | None, typer.Option(help="Shape instead of the file's.")] = None,
+    plan: Annotated[
+        str | None,
+        typer.Option(help="Legs instead of the file's, as velocity:1:0:20,turn:6:90,hold:5 (none: stay in place)."),
+    ] = None,
+    duration: Annotated[
+        float | None, typer.Option("--for", min=1, help="Seconds from take-off to the landing command.")
+    ] = None,
+    autopilot: Annotated[str, typer.Option(help="What flies: stub.")] = "stub",
+    seed: Annotated[int, typer.Option(min=0, help="Seed of gusts, noise and estimator origins.")] = 0,
+    calm: Annotated[bool, typer.Option("--calm", help="No gusts and no sensor noise.")] = False,
+    out: Annotated[Path, typer.Option(help="Folder for the flight's folder.")] = Path("flights"),
+    as_json: Annotated[bool, typer.Option("--json", help="Only summary.json on standard output.")] = False,
+) -> None:
+    """Start stub autopilots and companions, take off, form, fly the plan, land, and sum up.
+
+    Ctrl-C lands the fleet. Exit status: 0 the flight met its criteria, 1 it did not, 2 wrong usage or configuration.
+    """
+    from sim.launch import FlightOptions, flight_folder, fly
+    from sim.view import FlightView, show_summary
+
+    if autopilot != "stub":
+        raise ConfigError(f"--autopilot must be stub, got {autopilot!r}")
+    tables = _tables(fleet, vehicles, formation, plan)
+    if calm:
+        tables.setdefault("stub", {}).update(position_noise_m=0.0, velocity_noise_m_s=0.0, gust_m_s2=0.0)
+    from companion.config import parse
+
+    parse(tables, fleet.name)
+    options = FlightOptions(flight_folder(out), seed, duration)
+    interrupted = _interrupts()
+    with FlightView(quiet=as_json) as view:
+        summary = fly(tables, options, view.show, interrupted)
+    if as_json:
+        typer.echo(json.dumps(summary))
+    else:
+        show_summary(summary)
+    raise typer.Exit(0 if summary["passed"] else FAILED)
+
+
+def _interrupts() -> Callable[[], bool]:
+    """Whether SIGINT or SIGTERM came; the launcher lands its fleet then instead of dying."""
+    came: list[int] = []
+    for s in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(s, lambda number, _: came.append(number))
+    return lambda: bool(came)
+
+
+@app.command()
+def stub(
+    vehicles: Vehicles = None,
+    fleet: FleetFile = DEFAULT_FILE,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of gusts, noise and estimator origins.")] = 0,
+    truth: Annotated[Path | None, typer.Option(help="File for every vehicle's true motion at 50 Hz.")] = None,
+    launched: Annotated[
+        bool, typer.Option("--launched", help="End when standard input closes: for launchers.")
+    ] = False,
+) -> None:
+    """Run stub autopilots alone until interrupted: autopilot i at UDP 14580+i, its companion at 14540+i."""
+    from companion.config import parse
+    from sim.stub_fleet import stub_settings
+    from sim.stubs import run_stubs
+
+    config = parse(_tables(fleet, vehicles), fleet.name)
+    if not launched:
+        for v in config.vehicles:
+            typer.echo(f"vehicle {v.id}: system id {v.system_id}, speaks to {v.mavlink}", err=True)
+    run_stubs(
+        stub_settings(
+            config, seed=seed, truth_path=truth, stop_fd=sys.stdin.fileno() if launched else None,
+            grace_s=1.5 if launched else 0.0,
+        )
+    )  # fmt: skip
+
+
+@app.command(hidden=True)
+def reference_loop(out: Annotated[Path, typer.Option()]) -> None:
+    """An empty 50 Hz loop, to measure the machine beside a flight; ends when standard input closes."""
+    from sim.reference_loop import run_reference_loop
+
+    run_reference_loop(out, sys.stdin.fileno())
+
+
+# -- the operator's verbs --------------------------------------------------------------------------------------------
+
+
+def _operate(fleet: Path, vehicles: int | None, verb: str, act: Callable[[Any], Any]) -> None:
+    from companion.config import parse
+    from companion.io.loop import network_settings
+    from companion.io.zenoh_peers import OperatorLink
+    from companion.operate import Operator
+
+    config = parse(_tables(fleet, vehicles), fleet.name)
+    with OperatorLink(network_settings(config, None)) as link:
+        operator = Operator(config, link)
+        link.wait_alive(operator.ids, 2.0)
+        answers = act(operator)
+    typer.echo(answers.sentence(verb))
+    raise typer.Exit(0 if answers.all_accepted else FAILED)
+
+
+@app.command()
+def status(
+    fleet: FleetFile = DEFAULT_FILE,
+    vehicles: Vehicles = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Each vehicle's own account as JSON.")] = False,
+) -> None:
+    """Each vehicle's account of itself. Exit status 1 if one is silent."""
+    from companion.config import parse
+    from companion.io.loop import network_settings
+    from companion.io.zenoh_peers import OperatorLink
+    from companion.operate import Operator
+    from sim.view import show_status
+
+    config = parse(_tables(fleet, vehicles), fleet.name)
+    with OperatorLink(network_settings(config, None)) as link:
+        operator = Operator(config, link)
+        link.wait_alive(operator.ids, 2.0)
+        answers = operator.status()
+    if as_json:
+        typer.echo(json.dumps(answers))
+    else:
+        show_status(answers)
+    raise typer.Exit(0 if all(s is not None for s in answers.values()) else FAILED)
+
+
+@app.command()
+def takeoff(fleet: FleetFile = DEFAULT_FILE, vehicles: Vehicles = None) -> None:
+    """Arm and climb; a vehicle that is not ready refuses and says why."""
+    _operate(fleet, vehicles, "take-off", lambda o: o.take_off())
+
+
+@app.command()
+def land(fleet: FleetFile = DEFAULT_FILE, vehicles: Vehicles = None) -> None:
+    """Land every vehicle where it is."""
+    _operate(fleet, vehicles, "land", lambda o: o.land())
+
+
+@app.command()
+def hold(fleet: FleetFile = DEFAULT_FILE, vehicles: Vehicles = None) -> None:
+    """Stop the formation where it is."""
+    _operate(fleet, vehicles, "hold", lambda o: o.hold(time.time_ns()))
+
+
+@app.command()
+def form(
+    shape: Annotated[str, typer.Argument(help="v, line, column, circle, grid, spiral, sphere or custom.")],
+    fleet: FleetFile = DEFAULT_FILE,
+    vehicles: Vehicles = None,
+) -> None:
+    """Change the formation; its motion goes on."""
+    _operate(fleet, vehicles, f"form {shape}", lambda o: o.form(shape, time.time_ns()))
+
+
+@app.command()
+def move(
+    velocity: Annotated[
+        tuple[float, float, float] | None, typer.Option(metavar="NORTH EAST UP", help="Constant velocity (m/s).")
+    ] = None,
+    turn: Annotated[
+        tuple[float, float] | None,
+        typer.Option(metavar="DEG_S DEG", help="Turn at a rate (deg/s, positive right) through an angle; 0: for ever."),
+    ] = None,
+    goto: Annotated[
+        tuple[float, float] | None, typer.Option(metavar="NORTH EAST", help="Fly the centre to a point (m).")
+    ] = None,
+    altitude: Annotated[float | None, typer.Option(min=1, max=500, help="With --goto: altitude (m).")] = None,
+    speed: Annotated[float, typer.Option(min=0.1, max=8, help="With --goto: greatest speed (m/s).")] = 1.0,
+    fleet: FleetFile = DEFAULT_FILE,
+    vehicles: Vehicles = None,
+) -> None:
+    """Change the formation's motion: one of --velocity, --turn, --goto."""
+    from companion.operate import turn_leg, velocity_leg
+
+    if sum(x is not None for x in (velocity, turn, goto)) != 1:
+        raise ConfigError("fleet move needs exactly one of --velocity, --turn, --goto")
+    if turn is not None and turn[0] == 0:
+        raise ConfigError("fleet move --turn: the rate must not be 0 deg/s")
+
+    def act(operator: Any) -> Any:
+        now_ns = time.time_ns()
+        if velocity is not None:
+            return operator.move(velocity_leg(*velocity), now_ns)
+        if turn is not None:
+            return operator.move(turn_leg(turn[0], turn[1] or None), now_ns)
+        assert goto is not None
+        return operator.goto(*goto, altitude, speed, now_ns)
+
+    _operate(fleet, vehicles, "move", act)
+
+
+def main() -> None:
+    """Entry point: errors that a user can act on end with a sentence, not a traceback."""
+    try:
+        app(standalone_mode=True)
+    except CompanionError as error:
+        typer.echo(f"fleet: {error}", err=True)
+        raise SystemExit(USAGE_ERROR if isinstance(error, ConfigError) else FAILED) from None
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,266 @@
+"""A whole fleet on one machine: stubs and companions as processes, from take-off to the summary."""
+
+import json
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+import tomli_w
+from companion.io.recorder import read_recording
+
+from companion.config import FleetConfig, parse
+from companion.errors import CompanionError, RefusedError
+from companion.io.loop import network_settings
+from companion.io.zenoh_peers import OperatorLink
+from companion.operate import Operator
+from sim.reference_loop import read_reference_loop
+from sim.stubs import TRUTH_DTYPE
+from sim.summary import Flight, summarise
+
+READY_TIMEOUT_S = 30.0
+READY_TIMEOUT_PER_VEHICLE_S = 3.0
+LANDING_TIMEOUT_S = 90.0
+POLL_S = 1.0
+END_TIMEOUT_S = 5.0
+STUB_GRACE_S = 1.0
+LIBRARIES = ("starling-fleet", "pymavlink", "eclipse-zenoh", "numpy", "scipy", "pydantic", "mcap")
+
+
+@dataclass(frozen=True, slots=True)
+class FlightOptions:
+    """One flight of `fleet up`."""
+
+    folder: Path
+    seed: int = 0
+    duration_s: float | None = None
+    """from the take-off command to landing; None: until the plan lands, or for ever"""
+
+
+@dataclass(slots=True)
+class Progress:
+    """What the live table shows."""
+
+    elapsed_s: float
+    doing: str
+    vehicles: Mapping[int, Mapping[str, Any] | None]
+    ended: Mapping[int, int]
+    """vehicle -> exit status of its companion, where it has ended"""
+
+
+@dataclass(slots=True)
+class _Child:
+    name: str
+    process: subprocess.Popen[bytes]
+    log: IO[bytes]
+
+
+@dataclass(slots=True)
+class FleetProcesses:
+    """The children. Each ends by itself when its standard input closes, so none outlives this process."""
+
+    folder: Path
+    stack: ExitStack = field(default_factory=ExitStack)
+    children: dict[str, _Child] = field(default_factory=dict)
+
+    def start(self, name: str, *arguments: str) -> subprocess.Popen[bytes]:
+        """Start `python -m ...` with its output in NAME.log."""
+        log = self.stack.enter_context((self.folder / f"{name}.log").open("wb"))
+        process = subprocess.Popen(
+            [sys.executable, "-m", *arguments], stdin=subprocess.PIPE, stdout=log, stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )  # fmt: skip
+        self.children[name] = _Child(name, process, log)
+        return process
+
+    def exit_status(self, name: str) -> int | None:
+        """Exit status of a child that has ended, else None."""
+        return self.children[name].process.poll()
+
+    def log_tail(self, name: str, lines: int = 5) -> str:
+        """The last lines that a child has printed."""
+        text = (self.folder / f"{name}.log").read_text(errors="replace").strip().splitlines()
+        return "\n".join(text[-lines:])
+
+    def end(self, names: list[str], timeout_s: float) -> None:
+        """SIGTERM to each, and SIGKILL to whoever is still there after the timeout."""
+        for name in names:
+            process = self.children[name].process
+            if process.poll() is None:
+                process.terminate()
+        deadline = time.monotonic() + timeout_s
+        for name in names:
+            child = self.children[name]
+            try:
+                child.process.wait(max(deadline - time.monotonic(), 0.01))
+            except subprocess.TimeoutExpired:
+                child.process.kill()
+                child.process.wait()
+            if child.process.stdin is not None:
+                child.process.stdin.close()
+
+    def close(self) -> None:
+        """End whatever still runs."""
+        self.end(list(self.children), END_TIMEOUT_S)
+        self.stack.close()
+
+
+def flight_folder(root: Path) -> Path:
+    """A new folder for a flight, named by UTC."""
+    stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
+    for suffix in ("", *(f"-{k}" for k in range(2, 100))):
+        folder = root / f"{stamp}{suffix}"
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise CompanionError(f"cannot make the flight's folder {folder}: {error.strerror}") from error
+        return folder
+    raise CompanionError(f"cannot make a new folder in {root}")
+
+
+def fly(
+    tables: dict[str, Any], options: FlightOptions, show: Callable[[Progress], None], interrupted: Callable[[], bool]
+) -> dict[str, Any]:
+    """Fly a fleet of stubs from take-off to landing; returns the summary, which also lies in the flight's folder.
+
+    `tables` is fleet.toml with its overrides. Raises CompanionError when the fleet does not come up.
+    """
+    config = parse(tables, "fleet.toml")
+    folder = options.folder
+    (folder / "fleet.toml").write_text(tomli_w.dumps(_without_none(tables)))
+    processes = FleetProcesses(folder)
+    try:
+        return _fly(config, options, processes, show, interrupted)
+    finally:
+        processes.close()
+
+
+def _without_none(tables: Any) -> Any:
+    if isinstance(tables, dict):
+        return {k: _without_none(v) for k, v in tables.items() if v is not None}
+    return [_without_none(v) for v in tables] if isinstance(tables, list) else tables
+
+
+def _fly(
+    config: FleetConfig,
+    options: FlightOptions,
+    processes: FleetProcesses,
+    show: Callable[[Progress], None],
+    interrupted: Callable[[], bool],
+) -> dict[str, Any]:
+    folder = options.folder
+    file = str(folder / "fleet.toml")
+    began = time.monotonic()
+    ids = [v.id for v in config.vehicles]
+    processes.start("reference", "sim", "reference-loop", "--out", str(folder / "reference.bin"))
+    processes.start(
+        "stubs", "sim", "stub", "--fleet", file, "--seed", str(options.seed), "--truth", str(folder / "truth.bin"),
+        "--launched",
+    )  # fmt: skip
+    for i in ids:
+        processes.start(
+            f"companion-{i}", "companion", "run", "--vehicle", str(i), "--fleet", file, "--record",
+            str(folder / f"vehicle-{i}.mcap"), "--launched",
+        )  # fmt: skip
+    with OperatorLink(network_settings(config, None)) as link:
+        operator = Operator(config, link)
+        watch = _Watch(operator, processes, ids, show, began)
+        watch.until_ready(READY_TIMEOUT_S + READY_TIMEOUT_PER_VEHICLE_S * len(ids), interrupted)
+        takeoff_ns = time.time_ns()
+        answers = operator.take_off()
+        if not answers.all_accepted:
+            raise RefusedError(answers.sentence("take-off"))
+        lost = watch.fly(options.duration_s, interrupted)
+        final = watch.said
+    processes.end([f"companion-{i}" for i in ids], END_TIMEOUT_S)
+    processes.end(["stubs", "reference"], STUB_GRACE_S + END_TIMEOUT_S)
+    flight = Flight(
+        config=config,
+        seed=options.seed,
+        truth=np.fromfile(folder / "truth.bin", TRUTH_DTYPE),
+        takeoff_ns=takeoff_ns,
+        lost=lost,
+        versions={"python": sys.version.split()[0], **{name: version(name) for name in LIBRARIES}},
+    )
+    for i in ids:
+        flight.read(i, read_recording(folder / f"vehicle-{i}.mcap").entries)
+        said = final.get(i)
+        flight.rejected += Counter(said["rejected"] if said else {})
+    rows = read_reference_loop(folder / "reference.bin")
+    flight.reference_lateness_ns = rows[rows[:, 0] >= takeoff_ns, 1].astype(float)
+    summary = {**summarise(flight), "folder": str(folder)}
+    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    return summary
+
+
+@dataclass(slots=True)
+class _Watch:
+    """The launcher's eye on a flight: it asks once a second, shows, and notices who has gone."""
+
+    operator: Operator
+    processes: FleetProcesses
+    ids: list[int]
+    show: Callable[[Progress], None]
+    began: float
+    said: dict[int, dict[str, Any]] = field(default_factory=dict)
+    """each vehicle's last account"""
+
+    def _look(self, doing: str) -> dict[int, dict[str, Any] | None]:
+        answers = self.operator.status()
+        self.said.update({i: s for i, s in answers.items() if s is not None})
+        self.show(Progress(time.monotonic() - self.began, doing, answers, self.ended()))
+        return answers
+
+    def ended(self) -> dict[int, int]:
+        """Companions that have ended, with their exit status."""
+        status = {i: self.processes.exit_status(f"companion-{i}") for i in self.ids}
+        return {i: s for i, s in status.items() if s is not None}
+
+    def until_ready(self, timeout_s: float, interrupted: Callable[[], bool]) -> None:
+        """Wait until every vehicle says that it may take off."""
+        deadline = time.monotonic() + timeout_s
+        while True:
+            for name in ("stubs", *(f"companion-{i}" for i in self.ids)):
+                if self.processes.exit_status(name) is not None:
+                    raise CompanionError(f"{name} ended before take-off:\n{self.processes.log_tail(name)}")
+            answers = self._look("starting")
+            waiting = {i: ["silent"] if s is None else s["ready"] for i, s in answers.items()}
+            if all(not reasons for reasons in waiting.values()):
+                return
+            if interrupted():
+                raise CompanionError("interrupted before take-off")
+            if time.monotonic() > deadline:
+                named = "; ".join(f"vehicle {i}: {', '.join(r)}" for i, r in waiting.items() if r)
+                raise CompanionError(f"not ready after {timeout_s:.0f} s: {named}")
+            time.sleep(0.3)
+
+    def fly(self, duration_s: float | None, interrupted: Callable[[], bool]) -> frozenset[int]:
+        """Watch until all have landed; returns the vehicles whose companion ended before."""
+        start = time.monotonic()
+        landing_since: float | None = None
+        while True:
+            answers = self._look("landing" if landing_since is not None else "flying")
+            lost = frozenset(self.ended())
+            staying = [s for i, s in answers.items() if i not in lost and s is not None]
+            if len(lost) == len(self.ids):
+                return lost
+            done = [s["phase"] in ("landed", "released") and not s["armed"] for s in staying]
+            if staying and all(done) and len(staying) + len(lost) == len(self.ids):
+                return lost
+            over = duration_s is not None and time.monotonic() - start >= duration_s
+            if landing_since is None and (over or interrupted()):
+                landing_since = time.monotonic()
+                self.operator.land()
+            if landing_since is not None and time.monotonic() - landing_since > LANDING_TIMEOUT_S:
+                return lost
+            time.sleep(POLL_S)

@@ -1,0 +1,310 @@
+"""PX4's commander: arming, flight modes, failsafes, landing detection. Sans-I/O; every rule of those is in this file.
+
+Times are nanoseconds since boot. `step` is called on the autopilot's fixed grid after the dynamics have moved.
+"""
+
+from collections.abc import Callable
+from enum import Enum, IntEnum
+
+from sim.dynamics import GRAVITY_M_S2, THRUST_MIN_G, Vehicle
+from sim.px4.modes import (
+    MODE_OF_LOSS_ACTION,
+    RESTORED_MODES_EXCLUDED,
+    LandedState,
+    Mode,
+    OffboardLossAction,
+    SystemStatus,
+)
+from sim.px4.parameters import ParameterTable
+
+SECOND_NS = 1_000_000_000
+HOME_SET_NS = 3_600_000_000
+"""the home position is known this long after boot, as recorded"""
+READY_NS = 4_000_000_000
+"""armable this long after boot, as measured"""
+KILL_DISARM_NS = 5 * SECOND_NS
+"""a kill switch that stays on disarms after this long (COM_KILL_DISARM)"""
+
+
+class Result(IntEnum):
+    """MAV_RESULT."""
+
+    ACCEPTED = 0
+    TEMPORARILY_REJECTED = 1
+    DENIED = 2
+    UNSUPPORTED = 3
+    FAILED = 4
+
+
+class TakeoffState(Enum):
+    """PX4's take-off state machine (Takeoff.cpp): motors turn up before the velocity loop may lift."""
+
+    DISARMED = 0
+    SPOOLUP = 1
+    READY = 2
+    RAMPUP = 3
+    FLIGHT = 4
+
+
+class Commander:
+    """State of arming and modes of one vehicle, and the rules that change it."""
+
+    def __init__(self, parameters: ParameterTable, vehicle: Vehicle) -> None:
+        self._parameters = parameters
+        self._vehicle = vehicle
+        self.armed = False
+        self.user_mode = Mode.LOITER
+        """what the user chose: CURRENT_MODE.intended_custom_mode"""
+        self.mode = Mode.LOITER
+        """what flies"""
+        self.failsafe = False
+        self.landed_state = LandedState.ON_GROUND
+        self.takeoff_state = TakeoffState.DISARMED
+        self.setpoint_seen = False
+        """an offboard set-point has arrived since boot"""
+        self.setpoint_last_ns: int | None = None
+        """time of the last valid offboard set-point"""
+        self.position_valid = True
+        self.pilot_present = False
+        """somebody holds sticks"""
+        self.killed = False
+        self.low_battery = False
+        self.ever_flown = False
+        """has left the ground since it was armed"""
+        self._restored_mode = Mode.LOITER
+        self._armed_at_ns = 0
+        self._killed_at_ns = 0
+        self._ramp_start_ns = 0
+        self._contact_ns: int | None = None
+        self._landed_at_ns: int | None = None
+        self.on_home_moved: Callable[[], None] = lambda: None
+        """called when PX4 would set home anew: arming, lift-off, disarming"""
+
+    # What is true of the present state
+
+    def ready(self, now_ns: int) -> bool:
+        """The estimator and the sensors are up."""
+        return now_ns >= READY_NS
+
+    def setpoint_stream_alive(self, now_ns: int) -> bool:
+        """The last valid offboard set-point is younger than COM_OF_LOSS_T."""
+        if self.setpoint_last_ns is None:
+            return False
+        return now_ns - self.setpoint_last_ns <= round(self._parameters.number("COM_OF_LOSS_T") * SECOND_NS)
+
+    def may_fly(self, mode: Mode, now_ns: int) -> bool:
+        """What `mode` needs is there."""
+        if mode is Mode.OFFBOARD:
+            return self.setpoint_stream_alive(now_ns) and self.position_valid
+        if mode is Mode.POSCTL:
+            return self.pilot_present and self.position_valid
+        if mode.is_manual:
+            return self.pilot_present
+        if mode is Mode.MISSION:
+            return False  # there is never a mission in this stand-in
+        if mode is Mode.TERMINATION:
+            return True
+        return self.position_valid
+
+    def may_arm(self, now_ns: int) -> bool:
+        """The preflight checks pass in the present mode."""
+        prevents = (Mode.LAND, Mode.RTL, Mode.TERMINATION)
+        return (
+            self.ready(now_ns)
+            and not self.killed
+            and self.user_mode not in prevents
+            and self.may_fly(self.user_mode, now_ns)
+        )
+
+    @property
+    def on_ground(self) -> bool:
+        """The land detector's opinion."""
+        return self.landed_state is LandedState.ON_GROUND
+
+    def system_status(self, now_ns: int) -> SystemStatus:
+        """HEARTBEAT.system_status."""
+        if self.mode is Mode.TERMINATION or self.killed:
+            return SystemStatus.TERMINATED
+        if self.armed:
+            return SystemStatus.FAILSAFE if self.failsafe else SystemStatus.ACTIVE
+        return SystemStatus.STANDBY if self.may_arm(now_ns) else SystemStatus.NOT_READY
+
+    @property
+    def motors_run(self) -> bool:
+        """Thrust may be more than idle."""
+        return (
+            self.armed
+            and not self.killed
+            and self.mode is not Mode.TERMINATION
+            and self.takeoff_state in (TakeoffState.RAMPUP, TakeoffState.FLIGHT)
+        )
+
+    # What others ask for
+
+    def arm(self, now_ns: int, *, force: bool = False) -> Result:
+        """Answer to a request to arm."""
+        if self.armed:
+            return Result.ACCEPTED
+        if not (self.may_arm(now_ns) or (force and self.ready(now_ns))):
+            return Result.TEMPORARILY_REJECTED
+        self.armed = True
+        self.ever_flown = False
+        self._armed_at_ns = now_ns
+        self._landed_at_ns = None
+        self.on_home_moved()
+        return Result.ACCEPTED
+
+    def disarm(self, *, force: bool = False) -> Result:
+        """Answer to a request to disarm."""
+        if self.armed and not (self.on_ground or force):
+            return Result.TEMPORARILY_REJECTED
+        if self.armed:
+            self._disarm()
+        return Result.ACCEPTED
+
+    def _disarm(self) -> None:
+        self.armed = False
+        self.failsafe = False
+        if self.user_mode in RESTORED_MODES_EXCLUDED and self.user_mode is not Mode.TERMINATION:
+            self.user_mode = self._restored_mode
+        if self.mode is not Mode.TERMINATION:
+            self.mode = self.user_mode
+        self._landed_at_ns = None
+        self._contact_ns = None
+        self.on_home_moved()
+
+    def choose(self, mode: Mode, now_ns: int) -> Result:
+        """Answer to a user's mode change: free while disarmed, in flight only what can be flown."""
+        if self.mode is Mode.TERMINATION:
+            return Result.TEMPORARILY_REJECTED
+        if self.armed and not self.may_fly(mode, now_ns):
+            return Result.TEMPORARILY_REJECTED
+        self.user_mode = mode
+        if mode not in RESTORED_MODES_EXCLUDED:
+            self._restored_mode = mode
+        self._choose_active(now_ns)
+        return Result.ACCEPTED
+
+    def kill(self, now_ns: int) -> None:
+        """The pilot's kill switch: motors stop at once."""
+        if not self.killed:
+            self.killed = True
+            self._killed_at_ns = now_ns
+
+    # What happens by itself
+
+    def step(self, now_ns: int, *, wants_takeoff: bool) -> None:
+        """Failsafes, take-off state, landing detection, auto-disarm."""
+        if self.armed and self.killed and now_ns - self._killed_at_ns >= KILL_DISARM_NS:
+            self._disarm()
+        self._choose_active(now_ns)
+        self._step_takeoff(now_ns, wants_takeoff)
+        self._step_landed(now_ns)
+        self._step_auto_disarm(now_ns)
+
+    def _choose_active(self, now_ns: int) -> None:
+        if self.mode is Mode.TERMINATION:
+            return
+        if not self.armed:
+            self.mode, self.failsafe = self.user_mode, False
+            return
+        if self.user_mode is Mode.OFFBOARD and not self.may_fly(Mode.OFFBOARD, now_ns):
+            self._lose_offboard()
+        elif not self.position_valid and not self.user_mode.is_manual and self.user_mode is not Mode.TERMINATION:
+            # Without a position every automatic mode falls back to a blind descent, which PX4 shows as LAND.
+            self.mode, self.failsafe = Mode.LAND, True
+        else:
+            self.mode, self.failsafe = self.user_mode, False
+
+    def _lose_offboard(self) -> None:
+        number = self._parameters.integer("COM_OBL_RC_ACT")
+        known = number in OffboardLossAction.__members__.values()
+        action = OffboardLossAction(number) if known else OffboardLossAction.POSITION
+        if action is OffboardLossAction.DISARM:
+            self._disarm()
+            return
+        mode = MODE_OF_LOSS_ACTION[action]
+        if mode.is_auto and not self.position_valid:
+            mode = Mode.LAND
+        self.mode, self.failsafe = mode, True
+
+    def _step_takeoff(self, now_ns: int, wants_takeoff: bool) -> None:
+        if not self.armed:
+            self.takeoff_state = TakeoffState.DISARMED
+            return
+        state = self.takeoff_state
+        if state is TakeoffState.DISARMED:
+            state = TakeoffState.SPOOLUP
+        if state is TakeoffState.SPOOLUP:
+            spoolup_ns = round(self._parameters.number("COM_SPOOLUP_TIME") * SECOND_NS)
+            if now_ns - self._armed_at_ns >= spoolup_ns:
+                state = TakeoffState.READY
+        if state is TakeoffState.READY and wants_takeoff:
+            state = TakeoffState.RAMPUP
+            self._ramp_start_ns = now_ns
+            self._vehicle.reset_integrals()
+        if state is TakeoffState.RAMPUP and self._ramp_progress(now_ns) >= 1.0:
+            state = TakeoffState.FLIGHT
+        self.takeoff_state = state
+
+    def _ramp_progress(self, now_ns: int) -> float:
+        duration_ns = self._parameters.number("MPC_TKO_RAMP_T") * SECOND_NS
+        return 1.0 if duration_ns <= 0.0 else (now_ns - self._ramp_start_ns) / duration_ns
+
+    @property
+    def thrust_min_g(self) -> float:
+        """Least thrust the loop may ask for; none during the take-off ramp."""
+        return THRUST_MIN_G if self.takeoff_state is TakeoffState.FLIGHT else 0.0
+
+    def speed_up_limit_m_s(self, now_ns: int, limit_m_s: float) -> float:
+        """Largest climb rate allowed now; during the take-off ramp it starts where the loop gives no thrust at all."""
+        if self.takeoff_state is not TakeoffState.RAMPUP:
+            return limit_m_s
+        start = -GRAVITY_M_S2 / self._parameters.number("MPC_Z_VEL_P_ACC")
+        return start + (limit_m_s - start) * min(self._ramp_progress(now_ns), 1.0)
+
+    def _step_landed(self, now_ns: int) -> None:
+        vehicle = self._vehicle
+        if not self.armed:
+            self.landed_state = LandedState.ON_GROUND  # PX4 takes whatever is disarmed for landed
+            self._contact_ns = None
+            return
+        if self.on_ground:
+            thrust_builds_up = vehicle.thrust_down_m_s2 < 0.7 * GRAVITY_M_S2
+            if not vehicle.on_ground or (self.takeoff_state is TakeoffState.RAMPUP and thrust_builds_up):
+                self._lift_off()
+        elif vehicle.presses_down() and self.takeoff_state is not TakeoffState.RAMPUP:
+            if self._contact_ns is None:
+                self._contact_ns = now_ns
+            trigger_ns = round(self._parameters.number("LNDMC_TRIG_TIME") * SECOND_NS)
+            if now_ns - self._contact_ns >= trigger_ns:
+                self.landed_state = LandedState.ON_GROUND
+                self._landed_at_ns = now_ns
+            if 3 * (now_ns - self._contact_ns) >= 2 * trigger_ns:
+                self.takeoff_state = TakeoffState.READY  # "maybe landed": the motors idle
+        else:
+            self._contact_ns = None
+        if not self.on_ground:
+            if self.mode is Mode.TAKEOFF:
+                self.landed_state = LandedState.TAKEOFF
+            elif self.mode is Mode.LAND:
+                self.landed_state = LandedState.LANDING
+            else:
+                self.landed_state = LandedState.IN_AIR
+
+    def _lift_off(self) -> None:
+        self.landed_state = LandedState.IN_AIR
+        self.ever_flown = True
+        self._contact_ns = None
+        self._landed_at_ns = None
+        self.on_home_moved()
+
+    def _step_auto_disarm(self, now_ns: int) -> None:
+        if not self.armed or not self.on_ground:
+            return
+        if self._landed_at_ns is not None:
+            delay, since = self._parameters.number("COM_DISARM_LAND"), self._landed_at_ns
+        else:
+            delay, since = self._parameters.number("COM_DISARM_PRFLT"), self._armed_at_ns
+        if delay > 0.0 and now_ns - since >= round(delay * SECOND_NS):
+            self._disarm()

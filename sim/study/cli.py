@@ -1,0 +1,83 @@
+"""`fleet study NAME`: check what was asked, run it with a progress bar, write tables, figures and a report."""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from companion.errors import CompanionError, ConfigError
+from sim.study.common import (
+    STUDIES, Config, Outcome, load_config, parse_seeds, pieces, study_module, write_outcome, writable_folder,
+)  # fmt: skip
+from sim.study.report import write_report
+from sim.swarm import kernels
+
+DEFAULT_SEEDS = "0..19"
+JUDGED_SEEDS = "20..39"
+
+
+def study(
+    name: str,
+    seeds: str = "",
+    out: Path = Path("study"),
+    jobs: int = 1,
+    setup: Path | None = None,
+    console: Console | None = None,
+) -> Path:
+    """Run one study, or `all`; returns the report's path. What is refused raises ConfigError with a sentence."""
+    names = STUDIES if name == "all" else (name,)
+    for each in names:
+        study_module(each)
+    if setup is not None and name == "all":
+        raise ConfigError("--setup belongs to one study: name it instead of all")
+    if jobs < 1:
+        raise ConfigError(f"--jobs must be at least 1, got {jobs}")
+    chosen = parse_seeds(seeds or (JUDGED_SEEDS if name == "all" else DEFAULT_SEEDS))
+    configs = [load_config(each, setup) for each in names]
+    folder = writable_folder(out)
+    kernels()
+    console = console or Console()
+    done: list[tuple[Config, Outcome]] = []
+    bar = Progress(
+        TextColumn("{task.description:<10}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
+        TimeRemainingColumn(), console=console,
+    )  # fmt: skip
+    with bar:
+        for config in configs:
+            module = study_module(config.name)
+            used = tuple(module.seeds_used(chosen)) if hasattr(module, "seeds_used") else chosen
+            task = bar.add_task(config.name, total=len(used))
+            results = pieces(config, used, folder, jobs, lambda task=task: bar.advance(task))  # type: ignore[misc]
+            outcome: Outcome = module.finish(config, results, used)
+            write_outcome(config, outcome, used, folder)
+            done.append((config, outcome))
+    report = write_report(folder, name, done, seeds=chosen)
+    console.print(f"{report}: {sum(len(o.tables) for _, o in done)} tables, {sum(len(o.figures) for _, o in done)} figures")
+    return report
+
+
+app = typer.Typer(add_completion=False, help="The paper's results, which reading gives them, and ours beside them.")
+
+
+@app.command()
+def command(
+    name: Annotated[str, typer.Argument(help=f"one of {', '.join(STUDIES)}, or all")],
+    seeds: Annotated[str, typer.Option(help="as in 0..19 or 0,3,5; all: 20..39 unless said otherwise")] = "",
+    out: Annotated[Path, typer.Option(help="folder for tables, figures and report")] = Path("study"),
+    jobs: Annotated[int, typer.Option(help="processes")] = 1,
+    setup: Annotated[Path | None, typer.Option(help="your own copy of the study's TOML file")] = None,
+) -> None:
+    """Run a study: NAME.json, CSV, PNG, SVG and an HTML report in --out. Finished seeds are not run again."""
+    try:
+        study(name, seeds, out, jobs, setup)
+    except CompanionError as error:
+        Console(stderr=True).print(f"[bold red]refused:[/] {error}", highlight=False, soft_wrap=True)
+        raise typer.Exit(2) from error
+
+
+def main() -> None:
+    """Entry of `python -m sim.study`."""
+    app(args=sys.argv[1:], prog_name="fleet study")

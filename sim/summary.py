@@ -1,0 +1,322 @@
+"""What a flight was like: one account for stubs, PX4 and lockstep, from true states and from what was sent.
+
+Errors are computed from the vehicles' true motion (the stubs' or the simulator's), not from what companions believed;
+what they believed stands beside it.
+"""
+
+import json
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from companion.io.recorder import Entry
+
+from companion.config import FleetConfig
+from companion.core.monitor import algebraic_connectivity, centroid_error_m, formation_error_m, velocity_error_m_s
+from companion.core.plan import Motion, Programme
+from companion.io.loop import TICK_RECORD, TRAFFIC_RECORD
+from companion.wire.mavlink import Px4Mode
+from companion.wire.peer import decode_motion
+
+Array = npt.NDArray[Any]
+SETTLING_S = 3.0
+"""left out of the steady part after forming and after a change of formation"""
+WINDOW_S = 10.0
+ON_GROUND = 1
+REFERENCE_HZ = 20.0
+
+
+@dataclass(frozen=True, slots=True)
+class Put:
+    """One message of a vehicle to its peers."""
+
+    time_ns: int
+    vehicle_id: int
+    topic: str
+    size: int
+
+
+@dataclass(slots=True)
+class Flight:
+    """Everything that is known of one flight. Times are fleet time (UTC, ns)."""
+
+    config: FleetConfig
+    seed: int
+    truth: Array
+    """TRUTH_DTYPE records"""
+    takeoff_ns: int
+    motions: list[Motion] = field(default_factory=list)
+    puts: list[Put] = field(default_factory=list)
+    notes: list[tuple[int, int, str]] = field(default_factory=list)
+    """(time, vehicle, what happened)"""
+    ticks: dict[int, Array] = field(default_factory=dict)
+    """vehicle -> rows of (fleet ns, lateness ns, latency ns, process CPU ns, position error m, nearest m, sent)"""
+    traffic: dict[int, Array] = field(default_factory=dict)
+    """vehicle -> rows of (fleet ns, bytes sent)"""
+    rejected: Counter[str] = field(default_factory=Counter)
+    failsafes: list[str] = field(default_factory=list)
+    lost: frozenset[int] = frozenset()
+    """vehicles whose companion ended in flight"""
+    reference_lateness_ns: Array | None = None
+    versions: Mapping[str, str] = field(default_factory=dict)
+
+    def read(self, vehicle_id: int, entries: Iterable[Entry]) -> None:
+        """Take one companion's recording."""
+        ticks, traffic = [], []
+        for entry in entries:
+            now = entry.instant.fleet_ns
+            match entry.channel:
+                case "tick":
+                    ticks.append((now, *TICK_RECORD.unpack(entry.body)))
+                case "traffic":
+                    traffic.append((now, *TRAFFIC_RECORD.unpack(entry.body)))
+                case "note":
+                    self.note(now, vehicle_id, entry.body.decode())
+                case "output/peer":
+                    topic, _, payload = entry.body.partition(b"\0")
+                    self.put(now, vehicle_id, topic.decode(), payload)
+                case "input/command":
+                    self._command(entry.body)
+        self.ticks[vehicle_id] = np.array(ticks, dtype=float).reshape(-1, 7)
+        self.traffic[vehicle_id] = np.array(traffic, dtype=float).reshape(-1, 2)
+
+    def note(self, time_ns: int, vehicle_id: int, text: str) -> None:
+        """Take one note of a companion's."""
+        self.notes.append((time_ns, vehicle_id, text))
+        if text.startswith("failsafe: "):
+            self.failsafes.append(f"vehicle {vehicle_id}: {text.removeprefix('failsafe: ')}")
+
+    def put(self, time_ns: int, vehicle_id: int, topic: str, payload: bytes) -> None:
+        """Take one message of a companion's."""
+        self.puts.append(Put(time_ns, vehicle_id, topic, len(payload)))
+        if topic == "plan":
+            self.motions.append(decode_motion(payload))
+
+    def _command(self, body: bytes) -> None:
+        command = json.loads(body)
+        if command.get("verb") == "motion":
+            self.motions.append(decode_motion(json.dumps(command["motion"]).encode()))
+
+    def programme(self) -> Programme:
+        """The motions that won, one of each revision."""
+        best: dict[int, Motion] = {0: self.config.first_motion}
+        for motion in self.motions:
+            if motion.revision not in best or motion.order > best[motion.revision].order:
+                best[motion.revision] = motion
+        return Programme([best[r] for r in sorted(best)])
+
+
+def summarise(flight: Flight) -> dict[str, Any]:
+    """The flight's figures, as summary.json holds them."""
+    config = flight.config
+    ids = [v.id for v in config.vehicles]
+    staying = [i for i in ids if i not in flight.lost]
+    times, position, velocity, mode, landed, armed, gap = _arrays(flight.truth, ids)
+    formed_ns = _formed_ns(flight, staying)
+    programme = flight.programme()
+    steady = _steady(flight, programme, times, mode, formed_ns, [ids.index(i) for i in staying])
+    columns = [ids.index(i) for i in staying]
+    figures = _errors(programme, staying, times[steady], position[steady][:, columns], velocity[steady][:, columns])
+    seconds = float(steady.sum()) * _step_s(times)
+    window = (times[steady][0], times[steady][-1]) if steady.any() else (0, 0)
+    puts = [p for p in flight.puts if window[0] <= p.time_ns <= window[1] and p.vehicle_id in staying]
+    rate = len(puts) / max(len(staying), 1) / seconds if seconds else None
+    minimum, minimum_at_s = _minimum_distance(flight, times, position, landed)
+    ticks = [t for i, t in flight.ticks.items() if len(t)]
+    in_window = [t[(t[:, 0] >= window[0]) & (t[:, 0] <= window[1])] for t in ticks]
+    every = np.concatenate(in_window) if in_window else np.zeros((0, 7))
+    driven = every[every[:, 2] >= 0.0] if len(every) else every
+    ended = {i: bool(armed[-1, k] == 0 and landed[-1, k] == ON_GROUND) for k, i in enumerate(ids)} if len(times) else {}
+    summary: dict[str, Any] = {
+        "vehicles": len(ids),
+        "formed_after_s": None if formed_ns is None else _round((formed_ns - flight.takeoff_ns) * 1e-9),
+        "minimum_distance_m": minimum,
+        "minimum_distance_at_s": minimum_at_s,
+        "steady": {
+            "seconds": _round(seconds),
+            **figures,
+            "messages_per_vehicle_hz": _round(rate, 5),
+            "reduction_vs_20hz_percent": None if rate is None else _round(100.0 * (1.0 - rate / REFERENCE_HZ), 3),
+            "payload_bytes_per_vehicle_s": _round(_per_vehicle(sum(p.size for p in puts), staying, seconds)),
+            "wire_bytes_per_vehicle_s": _wire_bytes(flight, staying, window),
+            "position_error_believed_rms_m": _round(_rms(every[:, 4])) if len(every) else None,
+            "nearest_neighbour_believed_m": _round(float(every[:, 5].min())) if len(every) else None,
+        },
+        "setpoint_rate_hz": _round(_per_vehicle(float(every[:, 6].sum()), ids, seconds)) if len(every) else None,
+        "setpoint_gap_max_s": _round(float(gap.max())) if gap.size else None,
+        "loop_lateness_ms": _percentiles(every[:, 1]),
+        "latency_ms": _percentiles(driven[:, 2]),
+        "reference_lateness_ms": _percentiles(flight.reference_lateness_ns),
+        "cpu_per_tick_ms": _cpu_per_tick(in_window),
+        "landed": ended,
+        "lost": sorted(flight.lost),
+        "failsafes": flight.failsafes,
+        "rejected": dict(flight.rejected),
+        "seed": flight.seed,
+        "versions": dict(flight.versions),
+    }
+    summary["criteria"] = _criteria(summary, config)
+    return {"passed": all(c["met"] for c in summary["criteria"]), **summary}
+
+
+def _arrays(truth: Array, ids: Sequence[int]) -> tuple[Array, ...]:
+    """Truth as arrays over (time, vehicle); times at which a vehicle is missing are left out."""
+    order = np.argsort(truth["time_unix_ns"], kind="stable")
+    rows = truth[order]
+    per_vehicle = [rows[rows["vehicle_id"] == i] for i in ids]
+    common = per_vehicle[0]["time_unix_ns"]
+    grids = []
+    for mine in per_vehicle:
+        if len(mine) == 0:
+            return tuple(np.zeros((0, len(ids), *s)) for s in ((), (3,), (3,), (), (), (), ()))
+        grids.append(mine[np.clip(np.searchsorted(mine["time_unix_ns"], common), 0, len(mine) - 1)])
+    table = np.stack(grids, axis=1)
+    return (
+        common, table["position_ned_m"], table["velocity_ned_m_s"].astype(float), table["custom_mode"],
+        table["landed_state"], table["armed"], table["setpoint_gap_max_s"],
+    )  # fmt: skip
+
+
+def _formed_ns(flight: Flight, staying: Sequence[int]) -> int | None:
+    """When the last vehicle first reported that it had formed."""
+    first: dict[int, int] = {}
+    for time_ns, i, text in flight.notes:
+        if "-> formed" in text:
+            first[i] = min(time_ns, first.get(i, time_ns))
+    return max(first[i] for i in staying) if staying and all(i in first for i in staying) else None
+
+
+def _steady(
+    flight: Flight, programme: Programme, times: Array, mode: Array, formed_ns: int | None, columns: Sequence[int]
+) -> npt.NDArray[np.bool_]:
+    """Where all that stayed are in OFFBOARD, formed and not changing their formation."""
+    if formed_ns is None or not len(times):
+        return np.zeros(len(times), bool)
+    begin = formed_ns + round(SETTLING_S * 1e9)
+    steady = (times >= begin) & (mode[:, columns] == Px4Mode.OFFBOARD).all(axis=1)
+    landing = [t for t, i, text in flight.notes if "-> landing" in text and t > formed_ns and i not in flight.lost]
+    if landing:
+        steady &= times < min(landing)
+    for motion in programme.motions[1:]:
+        if motion.blend_start_ns == motion.start_ns:
+            steady &= (times < motion.start_ns) | (times > motion.blend_end_ns + round(SETTLING_S * 1e9))
+    return np.asarray(steady, bool)
+
+
+def _errors(programme: Programme, ids: Sequence[int], times: Array, position: Array, velocity: Array) -> dict[str, Any]:
+    names = ("formation_error_rms_m", "velocity_error_rms_m_s", "centroid_error_rms_m")
+    if not len(times):
+        return {**dict.fromkeys(names), "altitude_error_max_m": None, "lambda2_min": None, "windows": []}
+    formation, consensus, centroid, altitude = [], [], [], []
+    for t, p, v in zip(times, position, velocity, strict=True):
+        motion = programme.at(int(t))
+        moment = motion.moment(int(t))
+        slots = [moment.slot(motion.slots[i]) for i in ids]
+        p_ref = np.array([s.position_ned_m for s in slots])
+        v_ref = np.array([s.velocity_ned_m_s for s in slots])
+        formation.append(np.square(formation_error_m(p, p_ref)).mean())
+        consensus.append(np.square(velocity_error_m_s(v, v_ref)).mean())
+        centroid.append(centroid_error_m(p, p_ref) ** 2)
+        altitude.append(np.abs(p[:, 2] - p_ref[:, 2]).max())
+    windows = []
+    start = int(times[0])
+    for k in range(int((times[-1] - start) * 1e-9 / WINDOW_S) + 1):
+        inside = (times >= start + k * WINDOW_S * 1e9) & (times < start + (k + 1) * WINDOW_S * 1e9)
+        if inside.sum() > 1:
+            windows.append(
+                {
+                    "from_s": k * WINDOW_S,
+                    "formation_error_rms_m": _round(float(np.sqrt(np.array(formation)[inside].mean()))),
+                    "velocity_error_rms_m_s": _round(float(np.sqrt(np.array(consensus)[inside].mean()))),
+                }
+            )
+    return {
+        **{n: _round(float(np.sqrt(np.mean(x)))) for n, x in zip(names, (formation, consensus, centroid), strict=True)},
+        "altitude_error_max_m": _round(float(np.max(altitude))),
+        "lambda2_min": _round(min(algebraic_connectivity(p, 100.0) for p in position[:: max(len(position) // 20, 1)])),
+        "windows": windows,
+    }
+
+
+def _minimum_distance(
+    flight: Flight, times: Array, position: Array, landed: Array
+) -> tuple[float | None, float | None]:
+    """Smallest true distance of any pair of which one is in the air, and when (s after take-off)."""
+    best, best_at = None, None
+    n = position.shape[1] if position.ndim == 3 else 0
+    i, j = np.triu_indices(n, 1)
+    for start in range(0, len(times), 500):
+        part = slice(start, start + 500)
+        distance = np.linalg.norm(position[part][:, i] - position[part][:, j], axis=2)
+        flying = (landed[part][:, i] != ON_GROUND) | (landed[part][:, j] != ON_GROUND)
+        distance = np.where(flying & (times[part] >= flight.takeoff_ns)[:, None], distance, np.inf)
+        if distance.size and np.isfinite(distance.min()) and (best is None or distance.min() < best):
+            best = float(distance.min())
+            best_at = (times[part][int(distance.min(axis=1).argmin())] - flight.takeoff_ns) * 1e-9
+    return _round(best), _round(best_at)
+
+
+def _wire_bytes(flight: Flight, ids: Sequence[int], window: tuple[int, int]) -> float | None:
+    rates = []
+    for i in ids:
+        rows = flight.traffic.get(i)
+        if rows is not None and len(rows):
+            inside = rows[(rows[:, 0] >= window[0]) & (rows[:, 0] <= window[1])]
+            if len(inside) > 1:
+                rates.append((inside[-1, 1] - inside[0, 1]) / ((inside[-1, 0] - inside[0, 0]) * 1e-9))
+    return _round(float(np.mean(rates))) if rates else None
+
+
+def _cpu_per_tick(rows: Sequence[Array]) -> float | None:
+    """Mean over the vehicles of the whole process's CPU time per control tick (ms)."""
+    costs = [(t[-1, 3] - t[0, 3]) / (len(t) - 1) * 1e-6 for t in rows if len(t) > 1]
+    return _round(float(np.mean(costs))) if costs else None
+
+
+def _percentiles(nanoseconds: Array | None) -> dict[str, float | None]:
+    if nanoseconds is None or not len(nanoseconds):
+        return {"p50": None, "p99": None, "max": None}
+    p50, p99, most = np.percentile(nanoseconds * 1e-6, (50, 99, 100))
+    return {"p50": _round(float(p50)), "p99": _round(float(p99)), "max": _round(float(most))}
+
+
+def _per_vehicle(total: float, ids: Sequence[int], seconds: float) -> float | None:
+    return total / len(ids) / seconds if ids and seconds else None
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.square(values).mean()))
+
+
+def _step_s(times: Array) -> float:
+    return float(np.median(np.diff(times))) * 1e-9 if len(times) > 1 else 0.0
+
+
+def _round(value: float | None, digits: int = 4) -> float | None:
+    return None if value is None else round(value, digits)
+
+
+def _criteria(summary: Mapping[str, Any], config: FleetConfig) -> list[dict[str, Any]]:
+    """What a flight must meet to count as passed."""
+    steady = summary["steady"]
+    spacing = config.formation.spacing_m
+    rows: list[tuple[str, Any, str, float]] = [
+        ("minimum_distance_m", summary["minimum_distance_m"], ">=", 0.3 * spacing),
+        ("steady.formation_error_rms_m", steady["formation_error_rms_m"], "<=", 0.05 * spacing),
+        ("steady.centroid_error_rms_m", steady["centroid_error_rms_m"], "<=", 0.5),
+        ("failsafes", len(summary["failsafes"]), "<=", 0),
+        ("vehicles not landed and disarmed", sum(not x for x in summary["landed"].values()), "<=", 0),
+        ("companions lost", len(summary["lost"]), "<=", 0),
+    ]
+    return [
+        {
+            "what": what,
+            "value": value,
+            "limit": f"{relation} {limit:g}",
+            "met": value is not None and (value >= limit if relation == ">=" else value <= limit),
+        }
+        for what, value, relation, limit in rows
+    ]

@@ -1,0 +1,154 @@
+"""What people see of a flight: the live table, the status, the summary."""
+
+from collections.abc import Mapping
+from types import TracebackType
+from typing import Any, Self
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from sim.launch import Progress
+
+PLAIN_INTERVAL_S = 5.0
+
+
+def status_table(vehicles: Mapping[int, Mapping[str, Any] | None], rates: Mapping[int, float] | None = None) -> Table:
+    """One row a vehicle."""
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    table.add_column("vehicle", justify="right")
+    table.add_column("phase")
+    table.add_column("mode")
+    for name in ("slot error m", "neighbours", "nearest m", "messages/s", "oldest s", "late ms", "battery %"):
+        table.add_column(name, justify="right")
+    table.add_column("remarks")
+    for i, s in sorted(vehicles.items()):
+        if s is None:
+            table.add_row(str(i), Text("silent", style="red"))
+            continue
+        remarks = [*s["failsafes"], *(s["ready"] if s["phase"] in ("idle", "landed") and not s["armed"] else [])]
+        rejected = sum(s["rejected"].values())
+        if rejected:
+            remarks.append(f"{rejected} rejected")
+        style = {"formed": "green", "released": "red"}.get(s["phase"], "")
+        table.add_row(
+            str(i),
+            Text(s["phase"], style=style),
+            s["mode"].lower(),
+            _number(s["position_error_m"], 2),
+            str(s["neighbours"]),
+            _number(s["nearest_m"], 2),
+            _number(None if rates is None else rates.get(i), 2),
+            _number(s["oldest_age_s"], 1),
+            _number(s.get("lateness_ms"), 1),
+            _number(s["battery_percent"], 0) if s["battery_percent"] >= 0 else "-",
+            Text("; ".join(remarks), style="yellow"),
+        )
+    return table
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+class FlightView:
+    """The live table on a terminal; a line every five seconds elsewhere; nothing when quiet."""
+
+    def __init__(self, quiet: bool) -> None:
+        self._console = Console(stderr=True, quiet=quiet)
+        self._live = Live(console=self._console, refresh_per_second=4) if self._console.is_terminal else None
+        self._sent: dict[int, tuple[float, int]] = {}
+        self._rates: dict[int, float] = {}
+        self._told_s = -PLAIN_INTERVAL_S
+        self._doing = ""
+
+    def __enter__(self) -> Self:
+        if self._live is not None:
+            self._live.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+    def show(self, progress: Progress) -> None:
+        """Show the fleet as it is now."""
+        for i, s in progress.vehicles.items():
+            if s is not None:
+                then, before = self._sent.get(i, (progress.elapsed_s, s["messages"]))
+                if progress.elapsed_s - then >= PLAIN_INTERVAL_S:
+                    self._rates[i] = (s["messages"] - before) / (progress.elapsed_s - then)
+                    self._sent[i] = (progress.elapsed_s, s["messages"])
+                else:
+                    self._sent.setdefault(i, (progress.elapsed_s, s["messages"]))
+        head = f"{progress.elapsed_s:6.1f} s  {progress.doing}"
+        if progress.ended:
+            head += "  ended: " + ", ".join(f"companion {i} (status {s})" for i, s in sorted(progress.ended.items()))
+        if self._live is not None:
+            self._live.update(Group(Text(head), status_table(progress.vehicles, self._rates)))
+        elif progress.elapsed_s - self._told_s >= PLAIN_INTERVAL_S or progress.doing != self._doing:
+            self._told_s, self._doing = progress.elapsed_s, progress.doing
+            self._console.print(f"{head}: {_phases(progress.vehicles)}", highlight=False)
+
+
+def _phases(vehicles: Mapping[int, Mapping[str, Any] | None]) -> str:
+    counts: dict[str, int] = {}
+    for s in vehicles.values():
+        name = "silent" if s is None else s["phase"]
+        counts[name] = counts.get(name, 0) + 1
+    return ", ".join(f"{n} {name}" for name, n in counts.items())
+
+
+def show_status(vehicles: Mapping[int, Mapping[str, Any] | None]) -> None:
+    """The status of a fleet, once."""
+    Console().print(status_table(vehicles))
+
+
+def show_summary(summary: Mapping[str, Any]) -> None:
+    """The flight's figures and whether it met its criteria."""
+    steady = summary["steady"]
+    table = Table(box=None, pad_edge=False, show_header=False)
+    table.add_column()
+    table.add_column()
+    rows = [
+        ("vehicles", summary["vehicles"]),
+        ("formed after", _unit(summary["formed_after_s"], "s")),
+        ("minimum distance", _unit(summary["minimum_distance_m"], "m")),
+        ("formation error, rms", _unit(steady["formation_error_rms_m"], f"m over {steady['seconds']} s")),
+        ("velocity error, rms", _unit(steady["velocity_error_rms_m_s"], "m/s")),
+        ("centroid from plan, rms", _unit(steady["centroid_error_rms_m"], "m")),
+        ("messages a vehicle", _unit(steady["messages_per_vehicle_hz"], "/s")),
+        ("fewer than at 20 Hz", _unit(steady["reduction_vs_20hz_percent"], "%")),
+        (
+            "payload, wire a vehicle",
+            f"{steady['payload_bytes_per_vehicle_s']}, {steady['wire_bytes_per_vehicle_s']} B/s",
+        ),
+        ("sensor to setpoint p50, p99", _pair(summary["latency_ms"])),
+        ("loop lateness p50, p99", _pair(summary["loop_lateness_ms"])),
+        ("empty loop's p50, p99", _pair(summary["reference_lateness_ms"])),
+        ("CPU a tick", _unit(summary["cpu_per_tick_ms"], "ms")),
+        ("longest setpoint gap", _unit(summary["setpoint_gap_max_s"], "s")),
+        ("failsafes", "; ".join(summary["failsafes"]) or "none"),
+        ("lost companions", ", ".join(str(i) for i in summary["lost"]) or "none"),
+        ("rejected", ", ".join(f"{k} {v}" for k, v in summary["rejected"].items()) or "none"),
+        ("folder", summary.get("folder", "-")),
+    ]
+    for name, value in rows:
+        table.add_row(name, str(value))
+    console = Console()
+    console.print(table)
+    for c in summary["criteria"]:
+        if not c["met"]:
+            console.print(f"not met: {c['what']} {c['limit']}, got {c['value']}", style="red", highlight=False)
+    console.print("passed" if summary["passed"] else "not passed", style="green" if summary["passed"] else "red")
+
+
+def _unit(value: Any, unit: str) -> str:
+    return "-" if value is None else f"{value} {unit}"
+
+
+def _pair(p: Mapping[str, Any]) -> str:
+    return f"{p['p50']}, {p['p99']} ms"

@@ -1,0 +1,93 @@
+"""Holds: the damped one solves its differential equation, the others are what their names say."""
+
+from math import cos, exp, sin
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+
+from companion.core.hold import HoldKind, Weights, axis, damped, weights
+
+PROPERTY = settings(deadline=None, max_examples=60)
+values = st.floats(-100.0, 100.0)
+speeds = st.floats(-5.0, 5.0)
+KINDS: tuple[HoldKind, ...] = ("damped", "zero", "first")
+
+
+def reference(t: float) -> tuple[float, float, float]:
+    """Some plan: position, velocity, acceleration of one axis."""
+    return 0.8 * t + 2.0 * sin(0.4 * t), 0.8 + 0.8 * cos(0.4 * t), -0.32 * sin(0.4 * t)
+
+
+@settings(deadline=None, max_examples=15)
+@given(values, speeds, st.floats(0.2, 3.0), st.floats(0.0, 8.0))
+def test_damped_hold_solves_its_differential_equation(p: float, v: float, damping_s: float, tau_s: float) -> None:
+    """p' = v and v' = a_d - (v - v_d)/T_d: the vehicle flies its plan and loses what it had besides within T_d."""
+    start = 3.0
+
+    def rate(t: float, state: np.ndarray) -> list[float]:
+        _, v_d, a_d = reference(t)
+        return [state[1], a_d - (state[1] - v_d) / damping_s]
+
+    solution = solve_ivp(rate, (start, start + tau_s), [p, v], rtol=1e-9, atol=1e-9)
+    then, now = reference(start), reference(start + tau_s)
+    held = axis(p, v, then[0], then[1], now[0], now[1], weights("damped", tau_s, damping_s))
+    assert held == pytest.approx(tuple(solution.y[:, -1]), abs=1e-5)
+
+
+@PROPERTY
+@given(values, speeds, values, values, speeds, speeds, st.floats(0.0, 60.0))
+def test_zero_and_first_order_hold_ignore_the_plan(
+    p: float, v: float, ref_then: float, ref_now: float, v_then: float, v_now: float, tau_s: float
+) -> None:
+    assert axis(p, v, ref_then, v_then, ref_now, v_now, weights("zero", tau_s, 0.7)) == (p, v)
+    assert axis(p, v, ref_then, v_then, ref_now, v_now, weights("first", tau_s, 0.7)) == pytest.approx(
+        (p + tau_s * v, v), abs=1e-9
+    )
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("tau_s", [0.0, -1e-9, -0.5, -100.0])
+def test_a_sample_from_now_or_the_future_is_taken_as_it_is(kind: HoldKind, tau_s: float) -> None:
+    assert axis(7.0, 2.0, 1.0, 0.5, 1.0, 0.5, weights(kind, tau_s, 0.7)) == (7.0, 2.0)
+
+
+@PROPERTY
+@given(values, speeds, values, speeds, st.floats(0.0, 1e5))
+def test_an_old_damped_sample_flies_with_the_plan(p: float, v: float, ref: float, v_d: float, tau_s: float) -> None:
+    position, velocity = axis(p, v, ref, v_d, ref + v_d * tau_s, v_d, damped(tau_s, 0.7))
+    carried = 0.7 * (1.0 - exp(-tau_s / 0.7))
+    assert position == pytest.approx(p + v_d * tau_s + carried * (v - v_d), abs=1e-6)
+    assert abs(velocity - v_d) <= abs(v - v_d) + 1e-12
+
+
+@PROPERTY
+@given(values, speeds, values, speeds, values, speeds, st.floats(0.0, 20.0), values, speeds)
+def test_hold_moves_with_a_shifted_and_drifting_frame(
+    p: float, v: float, ref: float, v_d: float, ref_now: float, v_now: float, tau_s: float, shift: float, drift: float
+) -> None:
+    """Damped: what the plan does besides is added to the prediction and to nothing else."""
+    w = damped(tau_s, 0.7)
+    x, xv = axis(p, v, ref, v_d, ref_now, v_now, w)
+    y, yv = axis(
+        p + shift, v + drift, ref + shift, v_d + drift, ref_now + shift + drift * tau_s, v_now + drift, w
+    )
+    assert y == pytest.approx(x + shift + drift * tau_s, abs=1e-8)
+    assert yv == pytest.approx(xv + drift, abs=1e-9)
+
+
+@PROPERTY
+@given(st.floats(0.05, 5.0), st.floats(0.0, 50.0), st.floats(0.0, 50.0))
+def test_holding_twice_is_holding_once(damping_s: float, first_s: float, second_s: float) -> None:
+    """Splitting the time changes nothing, so a prediction may be sent on as a sample."""
+    a, b, whole = (damped(t, damping_s) for t in (first_s, second_s, first_s + second_s))
+    assert a.velocity * b.velocity == pytest.approx(whole.velocity, abs=1e-12)
+    assert a.position + a.velocity * b.position == pytest.approx(whole.position, abs=1e-9)
+
+
+def test_weights_of_a_known_age() -> None:
+    assert weights("damped", 0.7, 0.7) == pytest.approx(Weights(1.0, 0.7 * (1 - exp(-1)), exp(-1)))
+    assert weights("zero", 5.0, 0.7) == (0.0, 0.0, 1.0)
+    assert weights("first", 5.0, 0.7) == (0.0, 5.0, 1.0)
