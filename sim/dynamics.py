@@ -68,9 +68,9 @@ class DynamicsParameters:
 
     model: Literal["px4", "ideal"] = "px4"
     """`px4`: PX4's loops; `ideal`: double integrator for studies"""
-    attitude_lag_s: float = 0.12
+    attitude_lag_s: float = 0.15
     """time constant from commanded to flown horizontal acceleration (tilt), s; 0: none"""
-    thrust_lag_s: float = 0.05
+    thrust_lag_s: float = 0.07
     """time constant from commanded to flown vertical acceleration (motors), s; 0: none"""
     drag_per_s: float = 0.1
     """linear drag: acceleration -drag·v, 1/s. PX4's SIH: 1.0 by default"""
@@ -319,6 +319,10 @@ class Vehicle:
         """Forgets what the velocity loop has learned."""
         self._integral_north = self._integral_east = self._integral_down = 0.0
 
+    def learn(self, north_m_s2: float, east_m_s2: float, down_m_s2: float) -> None:
+        """Sets what the velocity loop's integrators hold, as after a long steady flight."""
+        self._integral_north, self._integral_east, self._integral_down = north_m_s2, east_m_s2, down_m_s2
+
     def _velocity_setpoint(
         self, setpoint: Setpoint, gain_horizontal: float, gain_vertical: float
     ) -> tuple[float, float, float]:
@@ -486,6 +490,13 @@ class Vehicle:
         self.velocity_north_m_s = self.velocity_east_m_s = self.velocity_down_m_s = 0.0
         self.acceleration_north_m_s2 = self.acceleration_east_m_s2 = self.acceleration_down_m_s2 = 0.0
         self._slope_north = self._slope_east = self._slope_down = 0.0
+
+    def shift(self, north_m: float, east_m: float, down_m: float) -> None:
+        """The frame has moved: the vehicle and the ground have other numbers, nothing else."""
+        self.north_m += north_m
+        self.east_m += east_m
+        self.down_m += down_m
+        self.ground_down_m += down_m
 
     def presses_down(self) -> bool:
         """On the ground with hardly any thrust left: what PX4's land detector takes for a landing."""

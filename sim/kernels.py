@@ -146,8 +146,8 @@ class Options(NamedTuple):
     relative_sigma: float
     """classic trigger: gamma_1; elastic: observer threshold coefficient"""
     relative_a: float
-    """classic trigger: gamma_2; elastic: r"""
-    elastic_epsilon: float
+    """classic trigger: gamma_2; elastic: rate of decay"""
+    elastic_amplitude: float
     observer_gain: float
     fault_agent: int
     fault_step: int
@@ -402,7 +402,7 @@ def fires(i: int, k: int, s: State, o: Options, et: ErrorTrigger, st: SwitchingT
     # the residual is the mean over neighbours, so that z_i is n times it
     if kind == CLASSIC:
         return ep + et.gamma_s2 * ev > classic_threshold(n, n * n * res, o.relative_sigma, o.relative_a)
-    return ep + et.gamma_s2 * ev >= elastic_threshold(res, t, o.relative_sigma, o.relative_a, o.elastic_epsilon)
+    return ep + et.gamma_s2 * ev >= elastic_threshold(res, t, o.relative_sigma, o.elastic_amplitude, o.relative_a)
 
 
 @kernel

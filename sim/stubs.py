@@ -40,23 +40,7 @@ longest time without a set-point while OFFBOARD flew. The file is these records 
 """
 TRUTH_INTERVAL_NS = 20_000_000
 FLUSH_INTERVAL_NS = 500_000_000
-AUTOPILOT_BASE_PORT = 14580
-COMPANION_BASE_PORT = 14540
-HIGH_AUTOPILOT_BASE_PORT = 25540
-HIGH_COMPANION_BASE_PORT = 24540
-PORTS_BELOW_GROUND_STATION = 10
-"""14550 is the ground station's, so the eleventh vehicle and those after it use the high ports"""
 RECEIVE_BUFFER_BYTES = 1 << 20
-
-
-def autopilot_port(index: int) -> int:
-    """UDP port that autopilot `index` (0-based) binds."""
-    return (AUTOPILOT_BASE_PORT if index < PORTS_BELOW_GROUND_STATION else HIGH_AUTOPILOT_BASE_PORT) + index
-
-
-def companion_port(index: int) -> int:
-    """UDP port that autopilot `index` (0-based) sends to."""
-    return (COMPANION_BASE_PORT if index < PORTS_BELOW_GROUND_STATION else HIGH_COMPANION_BASE_PORT) + index
 
 
 @dataclass(frozen=True, slots=True)
@@ -295,8 +279,6 @@ __all__ = [
     "TRUTH_DTYPE",
     "StubFleetSettings",
     "StubVehicleSettings",
-    "autopilot_port",
     "build_autopilot",
-    "companion_port",
     "run_stubs",
 ]

@@ -171,8 +171,8 @@ class Setup:
     classic_sigma: float = 0.6
     classic_a: float = 0.3
     elastic_sigma: float = 0.1
-    elastic_r: float = 0.4
-    elastic_epsilon: float = 5.0
+    elastic_amplitude: float = 5.0
+    elastic_rate: float = 0.4
     observer_gain: float = 2.0
 
     digest: int = 0
@@ -459,8 +459,8 @@ def _options(setup: Setup) -> Any:
         impulse_probability=setup.impulse_probability,
         lag=setup.lag_s,
         relative_sigma=setup.elastic_sigma if elastic else setup.classic_sigma,
-        relative_a=setup.elastic_r if elastic else setup.classic_a,
-        elastic_epsilon=setup.elastic_epsilon,
+        relative_a=setup.elastic_rate if elastic else setup.classic_a,
+        elastic_amplitude=setup.elastic_amplitude,
         observer_gain=setup.observer_gain,
         fault_agent=setup.fault_agent if fault else -1,
         fault_step=round(setup.fault_time_s / setup.dt_s) if fault else 2**40,

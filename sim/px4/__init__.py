@@ -1,1 +1,1 @@
-"""The parts of the stand-in PX4: modes, parameters, commander, navigator, estimator, link, streams, commands, faults."""
+"""The parts of the stand-in PX4; `sim.autopilot.Autopilot` puts them together."""

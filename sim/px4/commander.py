@@ -9,7 +9,7 @@ from enum import Enum, IntEnum
 from sim.dynamics import GRAVITY_M_S2, THRUST_MIN_G, Vehicle
 from sim.px4.modes import (
     MODE_OF_LOSS_ACTION,
-    RESTORED_MODES_EXCLUDED,
+    NOT_ARMABLE_MODES,
     LandedState,
     Mode,
     OffboardLossAction,
@@ -68,7 +68,7 @@ class Commander:
         self.pilot_present = False
         """somebody holds sticks"""
         self.killed = False
-        self.low_battery = False
+        self.battery_fraction = 1.0
         self.ever_flown = False
         """has left the ground since it was armed"""
         self._restored_mode = Mode.LOITER
@@ -108,11 +108,10 @@ class Commander:
 
     def may_arm(self, now_ns: int) -> bool:
         """The preflight checks pass in the present mode."""
-        prevents = (Mode.LAND, Mode.RTL, Mode.TERMINATION)
         return (
             self.ready(now_ns)
             and not self.killed
-            and self.user_mode not in prevents
+            and self.user_mode not in NOT_ARMABLE_MODES
             and self.may_fly(self.user_mode, now_ns)
         )
 
@@ -165,10 +164,8 @@ class Commander:
     def _disarm(self) -> None:
         self.armed = False
         self.failsafe = False
-        if self.user_mode in RESTORED_MODES_EXCLUDED and self.user_mode is not Mode.TERMINATION:
-            self.user_mode = self._restored_mode
         if self.mode is not Mode.TERMINATION:
-            self.mode = self.user_mode
+            self.mode = self.user_mode = self._restored_mode
         self._landed_at_ns = None
         self._contact_ns = None
         self.on_home_moved()
@@ -180,7 +177,7 @@ class Commander:
         if self.armed and not self.may_fly(mode, now_ns):
             return Result.TEMPORARILY_REJECTED
         self.user_mode = mode
-        if mode not in RESTORED_MODES_EXCLUDED:
+        if mode not in NOT_ARMABLE_MODES:
             self._restored_mode = mode
         self._choose_active(now_ns)
         return Result.ACCEPTED
@@ -190,6 +187,13 @@ class Commander:
         if not self.killed:
             self.killed = True
             self._killed_at_ns = now_ns
+
+    def move_sticks(self, now_ns: int) -> None:
+        """A pilot moves the sticks: a takeover of automatic modes (bit 0 of COM_RC_OVERRIDE) and of offboard (bit 1)."""
+        self.pilot_present = True
+        override = self._parameters.integer("COM_RC_OVERRIDE")
+        if (self.mode.is_auto and override & 1) or (self.mode is Mode.OFFBOARD and override & 2):
+            self.choose(Mode.POSCTL, now_ns)
 
     # What happens by itself
 
@@ -208,13 +212,27 @@ class Commander:
         if not self.armed:
             self.mode, self.failsafe = self.user_mode, False
             return
+        battery_mode = self._battery_action()
         if self.user_mode is Mode.OFFBOARD and not self.may_fly(Mode.OFFBOARD, now_ns):
             self._lose_offboard()
-        elif not self.position_valid and not self.user_mode.is_manual and self.user_mode is not Mode.TERMINATION:
-            # Without a position every automatic mode falls back to a blind descent, which PX4 shows as LAND.
+        elif not self.position_valid and (self.user_mode.is_auto or self.user_mode is Mode.POSCTL):
+            # Without a position every such mode falls back to a blind descent, which PX4 shows as LAND.
             self.mode, self.failsafe = Mode.LAND, True
+        elif battery_mode is not None and self.user_mode not in (battery_mode, Mode.LAND, Mode.TERMINATION):
+            self.mode, self.failsafe = battery_mode, True
         else:
             self.mode, self.failsafe = self.user_mode, False
+
+    def _battery_action(self) -> Mode | None:
+        """COM_LOW_BAT_ACT: 0 warns, 2 lands when critical, 3 returns when critical and lands in an emergency."""
+        if self.battery_fraction >= self._parameters.number("BAT_CRIT_THR"):
+            return None
+        action = self._parameters.integer("COM_LOW_BAT_ACT")
+        if action == 2:
+            return Mode.LAND
+        if action == 3:
+            return Mode.LAND if self.battery_fraction < self._parameters.number("BAT_EMERGEN_THR") else Mode.RTL
+        return None
 
     def _lose_offboard(self) -> None:
         number = self._parameters.integer("COM_OBL_RC_ACT")
@@ -256,8 +274,9 @@ class Commander:
         """Least thrust the loop may ask for; none during the take-off ramp."""
         return THRUST_MIN_G if self.takeoff_state is TakeoffState.FLIGHT else 0.0
 
-    def speed_up_limit_m_s(self, now_ns: int, limit_m_s: float) -> float:
+    def speed_up_limit_m_s(self, now_ns: int) -> float:
         """Largest climb rate allowed now; during the take-off ramp it starts where the loop gives no thrust at all."""
+        limit_m_s = self._parameters.number("MPC_Z_VEL_MAX_UP")
         if self.takeoff_state is not TakeoffState.RAMPUP:
             return limit_m_s
         start = -GRAVITY_M_S2 / self._parameters.number("MPC_Z_VEL_P_ACC")

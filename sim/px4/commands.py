@@ -48,17 +48,14 @@ class CommandTarget(Protocol):
     def set_interval_us(self, message_id: int, interval_us: float) -> bool:
         """Changes a stream's interval; False: no such stream."""
 
-    def interval_us(self, message_id: int) -> int:
-        """A stream's interval; -1 off, 0 not available."""
-
     def report_interval(self, message_id: int) -> None:
         """Sends MESSAGE_INTERVAL."""
 
     def change_mode(self, mode: Mode) -> Result:
         """A user's mode change."""
 
-    def reboot(self) -> None:
-        """Restarts from the beginning."""
+    def order_reboot(self) -> None:
+        """Restarts from the beginning, once the answer has left."""
 
 
 def _arm_disarm(target: CommandTarget, request: CommandRequest) -> Result:
@@ -141,7 +138,7 @@ def _reboot(target: CommandTarget, request: CommandRequest) -> Result:
     if target.commander.armed:
         return Result.TEMPORARILY_REJECTED
     if request.params[0] == 1.0:
-        target.reboot()
+        target.order_reboot()
     return Result.ACCEPTED
 
 

@@ -35,8 +35,6 @@ class Navigator:
         self._lifted = False
         self.takeoff_done = False
         """the last take-off has come within NAV_MC_ALT_RAD of its altitude"""
-        self.target_down_m = NAN
-        """down of the present target, for reports"""
 
     def enter(
         self,
@@ -76,6 +74,17 @@ class Navigator:
             self._target_down = down_m
         self._yaw = yaw_rad
 
+    def shift(self, north_m: float, east_m: float, down_m: float) -> None:
+        """The local frame has moved: everything local moves with it."""
+        self._north += north_m
+        self._east += east_m
+        self._down += down_m
+        self._target_down += down_m
+        if self._target is not None:
+            self._target = (self._target[0] + north_m, self._target[1] + east_m)
+        home_north, home_east, home_down = self._home
+        self._home = (home_north + north_m, home_east + east_m, home_down + down_m)
+
     def set_home(self, north_m: float, east_m: float, down_m: float) -> None:
         """Where RTL goes."""
         self._home = (north_m, east_m, down_m)
@@ -88,7 +97,6 @@ class Navigator:
         `down_m`: estimate; `height_m`: range finder; `lifted`: off the ground; `may_climb`: the take-off ramp lets it.
         """
         parameters = self._parameters
-        self.target_down_m = self._target_down
         if mode is Mode.TAKEOFF:
             return self._setpoint_takeoff(down_m, dt_s, lifted=lifted, may_climb=may_climb)
         if mode is Mode.LAND:

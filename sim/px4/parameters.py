@@ -3,8 +3,11 @@
 PARAM_VALUE has one float field. PX4 sends an INT32's four bytes in it ("bytewise"), not its value.
 """
 
+import math
 import struct
 from collections.abc import Mapping
+
+from sim.dynamics import LoopGains
 
 TYPE_INT32 = 6
 """MAV_PARAM_TYPE_INT32"""
@@ -165,3 +168,22 @@ class ParameterTable:
             for byte in data:
                 checksum = (checksum * 31 + byte) & 0x3FFFFFFF  # kept below the NaN patterns of a float
         return float(struct.unpack("<f", struct.pack("<I", checksum))[0])
+
+
+def loop_gains(parameters: ParameterTable) -> LoopGains:
+    """The position controller's constants as the parameters say."""
+    number = parameters.number
+    return LoopGains(
+        position_horizontal_per_s=number("MPC_XY_P"),
+        position_vertical_per_s=number("MPC_Z_P"),
+        velocity_horizontal_p=number("MPC_XY_VEL_P_ACC"),
+        velocity_horizontal_i=number("MPC_XY_VEL_I_ACC"),
+        velocity_horizontal_d=number("MPC_XY_VEL_D_ACC"),
+        velocity_vertical_p=number("MPC_Z_VEL_P_ACC"),
+        velocity_vertical_i=number("MPC_Z_VEL_I_ACC"),
+        velocity_vertical_d=number("MPC_Z_VEL_D_ACC"),
+        speed_max_horizontal_m_s=number("MPC_XY_VEL_MAX"),
+        speed_max_up_m_s=number("MPC_Z_VEL_MAX_UP"),
+        speed_max_down_m_s=number("MPC_Z_VEL_MAX_DN"),
+        tilt_max_rad=math.radians(number("MPC_TILTMAX_AIR")),
+    )

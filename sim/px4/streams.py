@@ -70,6 +70,8 @@ def _attitude_quaternion(s: Telemetry) -> Any:
 
 
 def _global_position_int(s: Telemetry) -> Any:
+    if not s.commander.position_valid:
+        return None
     latitude, longitude = s.degrees_e7(s.north_m, s.east_m)
     home_down = s.home_local_ned_m.down if s.home_local_ned_m is not None else 0.0
     heading = round(math.degrees(s.yaw_rad) * 100.0) % 36000
@@ -370,11 +372,11 @@ def _heartbeat(s: Telemetry) -> Any:
 
 def _estimator_status(s: Telemetry) -> Any:
     flags = 0x1 | 0x4 | 0x20 | 0x40
-    if s.gps_ok:
+    if s.commander.position_valid:
         flags |= 0x2 | 0x8 | 0x10 | 0x100 | 0x200
     if not s.commander.armed:
         flags |= 0x80  # at rest
-    accuracy = 0.3 if s.gps_ok else 30.0
+    accuracy = 0.3 + 0.5 * s.gps_lost_for_s
     return mavlink.MAVLink_estimator_status_message(
         s.now_ns // 1000, flags, 0.12, 0.05, 0.02, 0.08, 0.006, NAN, accuracy, 0.3
     )

@@ -57,7 +57,6 @@ class Telemetry:
         *,
         system_id: int,
         origin: Geodetic,
-        origin_in_fleet_ned_m: Ned,
         vehicle: Vehicle,
         commander: Commander,
         parameters: ParameterTable,
@@ -65,7 +64,6 @@ class Telemetry:
     ) -> None:
         self.system_id = system_id
         self.projection = Projection(origin)
-        self.origin_in_fleet_ned_m = origin_in_fleet_ned_m
         self.vehicle = vehicle
         self.commander = commander
         self.parameters = parameters
@@ -82,10 +80,33 @@ class Telemetry:
         self.home_local_ned_m: Ned | None = None
         self.home_time_ns = 0
         self.battery_fraction = 1.0
+        self.battery_forced: float | None = None
+        """a battery that is said to be at this fraction, whatever it has given"""
         self.reset_counter = 0
         self.gps_ok = True
-        self.target_system = 0
+        self.gps_lost_for_s = 0.0
         self.ping_sequence = 0
+
+    def count_reset(self) -> None:
+        """The estimate jumps: ODOMETRY.reset_counter says so."""
+        self.reset_counter = (self.reset_counter + 1) & 0xFF
+
+    def set_home(self, now_ns: int) -> None:
+        """Home is where the estimate is."""
+        self.home_local_ned_m = Ned(self.north_m, self.east_m, self.down_m)
+        self.home_time_ns = now_ns
+
+    def move_origin(self, origin: Geodetic, by_ned_m: Ned) -> None:
+        """The local frame's origin has moved by `by_ned_m`: what is local moves the other way."""
+        self.projection = Projection(origin)
+        self.north_m -= by_ned_m.north
+        self.east_m -= by_ned_m.east
+        self.down_m -= by_ned_m.down
+        home = self.home_local_ned_m
+        if home is not None:
+            self.home_local_ned_m = Ned(
+                home.north - by_ned_m.north, home.east - by_ned_m.east, home.down - by_ned_m.down
+            )
 
     # One estimate in every frame
 

@@ -22,14 +22,15 @@ def classic_threshold(n: float, z2: float, sigma: float, a: float) -> float:
     return sigma * a * (1.0 - a * n) / max(n, 1.0) * z2
 
 
-def elastic_threshold(mean_residual_2: float, t_s: float, coefficient: float, r: float, epsilon: float) -> float:
+def elastic_threshold(mean_residual_2: float, t_s: float, coefficient: float, amplitude: float, rate: float) -> float:
     """Largest |e_i|^2 without a message, of the resilient ("elastic") distributed trigger, reference [25].
 
     The text names an observer gain of 2, an observer threshold coefficient of 0.1 and a recovery time of 1 s, Table 2
-    r = 0.4 as decay factor and epsilon = 5. Guesses: a threshold relative to the mean formation residual with that
-    coefficient, plus epsilon e^(-r t); neighbours are not held but followed by the observer below.
+    r = 0.4 as decay factor and epsilon = 5. Guesses: a threshold relative to the squared mean formation residual with
+    that coefficient, plus a decaying part that is either epsilon e^(-r t) or r e^(-epsilon t) (both are studied);
+    neighbours are not held but followed by the observer below.
     """
-    return coefficient * mean_residual_2 + epsilon * exp(-r * t_s)
+    return coefficient * mean_residual_2 + amplitude * exp(-rate * t_s)
 
 
 def observer_axis(p: float, v: float, sent_p: float, sent_v: float, gain: float, dt_s: float) -> tuple[float, float]:

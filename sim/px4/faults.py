@@ -1,0 +1,78 @@
+"""Faults that a test or an operator orders from the stand-in autopilot. Values only; the autopilot carries them out."""
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+
+from companion.core.frames import Ned
+
+
+class FaultKind(StrEnum):
+    """What breaks. `magnitude` of `Fault` means, and defaults to, what is said here."""
+
+    GPS_LOST = "gps_lost"
+    """no fix; the estimate drifts by magnitude m/s (0.3), and is invalid after EKF2_NOAID_TOUT"""
+    POSITION_FROZEN = "position_frozen"
+    """positions reported repeat themselves with fresh time stamps; velocities go on"""
+    ESTIMATOR_RESET = "estimator_reset"
+    """the estimator's origin moves by offset_ned_m, local positions jump by as much the other way"""
+    NOISE = "noise"
+    """the estimate's error grows by magnitude m and m/s per axis (0.5)"""
+    LOW_BATTERY = "low_battery"
+    """the battery is at the fraction magnitude (0.06: critical)"""
+    REBOOT = "reboot"
+    """the autopilot restarts, wherever it is; the motors stop"""
+    MUTE = "mute"
+    """nothing is sent any more; what arrives still counts"""
+    PILOT_TAKEOVER = "pilot_takeover"
+    """a pilot appears and switches to position mode"""
+    PILOT_STICKS = "pilot_sticks"
+    """a pilot appears and moves the sticks, which COM_RC_OVERRIDE may or may not take for a takeover"""
+    RC_KILL = "rc_kill"
+    """the pilot's kill switch"""
+    SLOW_LINK = "slow_link"
+    """the link carries magnitude bytes/s towards the companion (5760, a radio at 57600 baud)"""
+
+
+DEFAULT_MAGNITUDE = {
+    FaultKind.GPS_LOST: 0.3,
+    FaultKind.NOISE: 0.5,
+    FaultKind.LOW_BATTERY: 0.06,
+    FaultKind.SLOW_LINK: 5760.0,
+}
+LASTING = frozenset(
+    {
+        FaultKind.GPS_LOST,
+        FaultKind.POSITION_FROZEN,
+        FaultKind.NOISE,
+        FaultKind.LOW_BATTERY,
+        FaultKind.MUTE,
+        FaultKind.SLOW_LINK,
+    }
+)
+"""faults that have an end; the others happen at once"""
+DEFAULT_OFFSET_NED_M = Ned(4.0, -3.0, 0.5)
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """One fault of one vehicle, from the moment it is injected."""
+
+    kind: FaultKind
+    magnitude: float | None = None
+    """as said at the kind; None: its default"""
+    duration_s: float = math.inf
+    """how long a lasting fault lasts, s; 0 ends one that is there"""
+    offset_ned_m: Ned = DEFAULT_OFFSET_NED_M
+    """of an estimator reset: how far the origin moves, m"""
+
+    def __post_init__(self) -> None:
+        if not self.duration_s >= 0.0:
+            raise ValueError(f"duration_s must be >= 0 s, got {self.duration_s}")
+        if self.magnitude is not None and not 0.0 <= self.magnitude < math.inf:
+            raise ValueError(f"magnitude must be >= 0, got {self.magnitude}")
+
+    @property
+    def strength(self) -> float:
+        """The magnitude, or the kind's default."""
+        return DEFAULT_MAGNITUDE.get(self.kind, 0.0) if self.magnitude is None else self.magnitude

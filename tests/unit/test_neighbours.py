@@ -1,0 +1,557 @@
+"""The peer table: what is refused and counted, how peers are predicted, gated, lost and found again."""
+
+from dataclasses import replace
+from math import cos, dist, inf, nan, pi, sin
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from companion.core.formation import shape_slots
+from companion.core.frames import Ned
+from companion.core.hold import HoldKind
+from companion.core.neighbours import (
+    FUTURE_LIMIT_S,
+    GATE_RESIDUAL_M,
+    GATE_VELOCITY_M_S,
+    PRESENCE_DELAY_S,
+    UNCERTAINTY_GROWTH_M_S,
+    UNCERTAINTY_GROWTH_MAX_M,
+    PeerLimits,
+    PeerTable,
+    held,
+    is_outlier,
+)
+from companion.core.plan import Motion, Programme, SlotChange, TurnLeg, VelocityLeg, with_legs
+from companion.core.values import Instant, Neighbour, PeerMessage, PeerSample, Phase
+
+PROPERTY = settings(deadline=None, max_examples=60)
+START_NS = 1_790_000_000_000_000_000
+ZERO = Ned(0.0, 0.0, 0.0)
+LIMITS = PeerLimits(
+    hold="damped", hold_damping_s=0.7, range_m=100.0, stale_after_s=12.0, isolated_flight_s=5.0, uncertainty_m=0.4,
+    digest_size=3,
+)  # fmt: skip
+OWN = 1
+
+
+def ns(seconds: float) -> int:
+    return START_NS + round(seconds * 1e9)
+
+
+def at(seconds: float) -> Instant:
+    return Instant(round(seconds * 1e9), ns(seconds))
+
+
+def column_at_1_m_s(count: int = 5, **changed: object) -> Motion:
+    """Vehicles 1, 2, ... in a column northward at 1 m/s, 4 m apart."""
+    slots = shape_slots("column", count, 4.0)
+    values: dict[str, object] = {
+        "revision": 1, "start_ns": START_NS, "issuer": 0, "shape": "column",
+        "slots": {i: SlotChange(s, s) for i, s in enumerate(slots, 1)}, "blend_start_ns": START_NS, "blend_s": 0.0,
+        "legs_start_ns": START_NS, "centre_ned_m": Ned(0.0, 0.0, -10.0), "velocity_ned_m_s": Ned(1.0, 0.0, 0.0),
+        "heading_rad": 0.0, "heading_rate_rad_s": 0.0, "heading_follows_turns": False, "legs": (),
+    }  # fmt: skip
+    return Motion(**(values | changed))  # type: ignore[arg-type]
+
+
+def table(motion: Motion | None = None, **limits: object) -> PeerTable:
+    motion = motion or column_at_1_m_s()
+    changed = replace(LIMITS, **limits)  # type: ignore[arg-type]
+    return PeerTable(OWN, frozenset(motion.slots) - {OWN}, changed, Programme([motion]))
+
+
+def sample(t: PeerTable, vehicle: int, seconds: float, phase: Phase = Phase.FORMED, **changed: object) -> PeerSample:
+    """Of a vehicle in its slot."""
+    r = t.programme.reference(vehicle, ns(seconds))
+    made = PeerSample(vehicle, ns(seconds), r.position_ned_m, r.velocity_ned_m_s, 1, phase)
+    return replace(made, **changed)  # type: ignore[arg-type]
+
+
+def message(s: PeerSample, sequence: int = 1, boot_id: int = 7, digest: tuple[PeerSample, ...] = ()) -> PeerMessage:
+    return PeerMessage(boot_id, sequence, START_NS, 0, s, digest)
+
+
+def predicted(t: PeerTable, seconds: float, gated: bool = False) -> dict[int, Neighbour]:
+    now = at(seconds)
+    motion = t.programme.at(now.fleet_ns)
+    moment = motion.moment(now.fleet_ns)
+    own = moment.slot(motion.slots[OWN]).position_ned_m
+    return {n.vehicle_id: n for n in t.predict(own, now, moment, gated)}
+
+
+# -- what is refused -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changed", "reason"),
+    [
+        ({"vehicle_id": 9}, "foreign id"),
+        ({"vehicle_id": 0}, "foreign id"),
+        ({"vehicle_id": OWN}, "own id"),
+        ({"position_ned_m": Ned(nan, 0.0, 0.0)}, "not finite"),
+        ({"position_ned_m": Ned(0.0, inf, 0.0)}, "not finite"),
+        ({"velocity_ned_m_s": Ned(0.0, 0.0, -inf)}, "not finite"),
+        ({"velocity_ned_m_s": Ned(0.0, nan, 0.0)}, "not finite"),
+        ({"time_ns": ns(10.0 + FUTURE_LIMIT_S + 0.001)}, "from the future"),
+        ({"time_ns": ns(10.0 + FUTURE_LIMIT_S)}, None),
+        ({"time_ns": ns(-3600.0)}, None),
+        ({}, None),
+    ],
+)
+def test_a_message_is_taken_or_refused_and_counted(changed: dict[str, object], reason: str | None) -> None:
+    t = table()
+    assert t.accept(message(sample(t, 2, 10.0, **changed)), at(10.0)) == reason
+    assert t.rejected == ({} if reason is None else {reason: 1})
+    assert (t.sample(2) is not None) is (reason is None)
+
+
+def test_a_refused_message_brings_no_digest_and_no_presence() -> None:
+    t = table()
+    bad = sample(t, 2, 1.0, position_ned_m=Ned(nan, 0.0, 0.0))
+    t.accept(message(bad, digest=(sample(t, 3, 0.5),)), at(1.0))
+    assert t.sample(3) is None
+    assert t.phases() == dict.fromkeys((2, 3, 4, 5))
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "taken"),
+    [
+        (5, 6, True),
+        (5, 5, False),
+        (5, 4, False),
+        (0, (1 << 31) - 1, True),
+        (0, 1 << 31, False),
+        ((1 << 32) - 1, 0, True),  # past the end of the counter
+        ((1 << 32) - 2, 3, True),
+        (3, (1 << 32) - 2, False),
+    ],
+)
+def test_sequence_numbers_are_compared_round_the_counter(first: int, second: int, taken: bool) -> None:
+    t = table()
+    assert t.accept(message(sample(t, 2, 1.0), first), at(1.0)) is None
+    assert (t.accept(message(sample(t, 2, 2.0), second), at(2.0)) is None) is taken
+    assert t.rejected["repeated or out of order"] == (0 if taken else 1)
+    newest = t.sample(2)
+    assert newest is not None
+    assert newest.time_ns == ns(2.0 if taken else 1.0)
+
+
+def test_a_restarted_peer_counts_from_anywhere() -> None:
+    t = table()
+    t.accept(message(sample(t, 2, 1.0), 900, boot_id=7), at(1.0))
+    assert t.accept(message(sample(t, 2, 2.0), 0, boot_id=8), at(2.0)) is None
+    assert t.boot_id(2) == 8
+    assert t.accept(message(sample(t, 2, 3.0), 0, boot_id=8), at(3.0)) == "repeated or out of order"
+
+
+@PROPERTY
+@given(st.lists(st.tuples(st.integers(2, 5), st.floats(0.0, 30.0)), min_size=1, max_size=30))
+def test_the_newest_sample_stays_whatever_the_order_of_arrival(arrivals: list[tuple[int, float]]) -> None:
+    t = table()
+    for k, (vehicle, seconds) in enumerate(arrivals):
+        other = 2 if vehicle != 2 else 3
+        t.accept(message(sample(t, other, 0.0), k, digest=(sample(t, vehicle, seconds),)), at(30.0))
+    for vehicle in {v for v, _ in arrivals}:
+        kept = t.sample(vehicle)
+        assert kept is not None
+        assert kept.time_ns == max(ns(s) for v, s in arrivals if v == vehicle)
+
+
+# -- digests ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_digest_is_newest_first_and_bounded() -> None:
+    t = table()
+    for vehicle, seconds in ((2, 3.0), (3, 9.0), (4, 1.0), (5, 9.0)):
+        t.accept(message(sample(t, vehicle, seconds)), at(10.0))
+    assert [s.vehicle_id for s in t.digest()] == [3, 5, 2]
+
+
+def test_a_digest_leaves_the_lost_out() -> None:
+    t = table()
+    for vehicle in (2, 3):
+        t.accept(message(sample(t, vehicle, 1.0)), at(1.0))
+    t.presence(2, False, at(2.0))
+    assert [s.vehicle_id for s in t.digest()] == [3]
+
+
+def test_a_peer_heard_only_by_digest_is_a_neighbour_but_not_present() -> None:
+    t = table()
+    t.accept(message(sample(t, 2, 1.0), digest=(sample(t, 3, 0.9), sample(t, OWN, 0.9))), at(1.0))
+    assert predicted(t, 1.1)[3].in_formation
+    assert t.phases()[3] is None
+    assert t.rejected == {}  # that others pass on what we said is as it should be
+
+
+@pytest.mark.parametrize(
+    ("changed", "reason"),
+    [
+        ({"vehicle_id": 77}, "foreign id"),
+        ({"velocity_ned_m_s": Ned(nan, 0.0, 0.0)}, "not finite"),
+        ({"time_ns": ns(9.0)}, "from the future"),
+    ],
+)
+def test_bad_hearsay_is_left_out_and_counted_and_the_rest_is_kept(changed: dict[str, object], reason: str) -> None:
+    t = table()
+    digest = (sample(t, 3, 0.9, **changed), sample(t, 4, 0.8))
+    assert t.accept(message(sample(t, 2, 1.0), digest=digest), at(1.0)) is None
+    assert t.rejected == {f"digest: {reason}": 1}
+    assert t.sample(3) is None
+    assert t.sample(4) is not None
+
+
+# -- prediction ------------------------------------------------------------------------------------------------------
+
+KINDS: tuple[HoldKind, ...] = ("damped", "zero", "first")
+displacements = st.builds(Ned, *[st.floats(-3.0, 3.0)] * 3)
+
+
+@PROPERTY
+@given(st.sampled_from(KINDS), st.sampled_from(list(Phase)), displacements, displacements, st.floats(0.0, 11.0))
+def test_receiver_predicts_what_the_sender_compares_with(
+    kind: HoldKind, phase: Phase, shift: Ned, drift: Ned, age_s: float
+) -> None:
+    turn = column_at_1_m_s(legs=(TurnLeg(0.1, inf),), heading_follows_turns=True)
+    t = table(turn, hold=kind)
+    r = turn.reference(3, ns(20.0))
+    sent = PeerSample(
+        3, ns(20.0), Ned(*map(sum, zip(r.position_ned_m, shift, strict=True))),
+        Ned(*map(sum, zip(r.velocity_ned_m_s, drift, strict=True))), 1, phase,
+    )  # fmt: skip
+    t.accept(message(sent), at(20.0))
+    sender = held(
+        sent, (r.position_ned_m, r.velocity_ned_m_s), turn.reference(3, ns(20.0 + age_s)), ns(20.0 + age_s), t.limits
+    )
+    n = predicted(t, 20.0 + age_s)[3]
+    assert (n.position_ned_m, n.velocity_ned_m_s) == sender
+    assert n.age_s == pytest.approx(age_s, abs=1e-9)
+
+
+def test_a_vehicle_in_its_slot_is_predicted_in_its_slot_through_a_turn() -> None:
+    turn = column_at_1_m_s(legs=(TurnLeg(0.1, inf),), heading_follows_turns=True)
+    t = table(turn)
+    t.accept(message(sample(t, 4, 20.0)), at(20.0))
+    n, r = predicted(t, 29.0)[4], turn.reference(4, ns(29.0))
+    assert n.position_ned_m == pytest.approx(r.position_ned_m, abs=1e-9)
+    assert n.velocity_ned_m_s == pytest.approx(r.velocity_ned_m_s, abs=1e-9)
+    assert n.reference_velocity_ned_m_s == r.velocity_ned_m_s
+    assert n.reference_acceleration_ned_m_s2 == r.acceleration_ned_m_s2
+    own = turn.reference(OWN, ns(29.0)).position_ned_m
+    assert n.offset_ned_m == pytest.approx([a - b for a, b in zip(own, r.position_ned_m, strict=True)])
+
+
+def test_a_climbing_peer_stays_over_its_spot_and_comes_to_rest() -> None:
+    t = table()
+    up = sample(t, 2, 0.0, Phase.CLIMBING, position_ned_m=Ned(5.0, 6.0, -3.0), velocity_ned_m_s=Ned(0.3, 0.0, -1.5))
+    t.accept(message(up), at(0.0))
+    n = predicted(t, 30.0)[2]
+    assert n.position_ned_m == pytest.approx((5.0, 6.0, -6.0), abs=1e-5)
+    assert n.velocity_ned_m_s == pytest.approx((0.0, 0.0, 0.0), abs=1e-5)
+    assert not n.in_formation
+    assert not n.shares_avoidance
+    assert n.other_end_ned_m is None
+
+
+@pytest.mark.parametrize("phase", [Phase.IDLE, Phase.LANDED, Phase.RELEASED])
+def test_a_peer_that_is_not_ours_to_move_is_where_it_was(phase: Phase) -> None:
+    t = table()
+    t.accept(message(sample(t, 2, 0.0, phase)), at(0.0))
+    n = predicted(t, 9.0)[2]
+    assert n.position_ned_m == t.programme.reference(2, ns(0.0)).position_ned_m
+    assert n.velocity_ned_m_s == ZERO
+    assert not n.shares_avoidance
+
+
+def test_neighbours_come_in_the_order_of_their_ids_and_only_those_ever_heard() -> None:
+    t = table()
+    for vehicle in (5, 2, 4):
+        t.accept(message(sample(t, vehicle, 1.0)), at(1.0))
+    assert list(predicted(t, 1.0)) == [2, 4, 5]
+
+
+@pytest.mark.parametrize(("range_m", "heard"), [(7.999, [2]), (8.001, [2, 3]), (12.001, [2, 3, 4])])
+def test_only_peers_within_range_are_neighbours(range_m: float, heard: list[int]) -> None:
+    t = table(range_m=range_m)
+    for vehicle in (2, 3, 4, 5):
+        t.accept(message(sample(t, vehicle, 1.0)), at(1.0))
+    assert list(predicted(t, 1.0)) == heard
+
+
+def test_a_sample_from_slightly_ahead_counts_as_new() -> None:
+    t = table()
+    s = sample(t, 2, 5.5)
+    t.accept(message(s), at(5.0))
+    n = predicted(t, 5.0)[2]
+    assert n.age_s == 0.0
+    assert n.position_ned_m == pytest.approx(t.programme.reference(2, ns(5.0)).position_ned_m)
+
+
+def test_after_a_new_motion_old_samples_are_held_under_it() -> None:
+    t = table()
+    t.accept(message(sample(t, 2, 5.0)), at(5.0))
+    t.programme.adopt(with_legs(t.programme.newest, at_ns=ns(4.0), issuer=1, legs=(VelocityLeg(ZERO, 0.0),)))
+    t.plan_changed()
+    s = t.sample(2)
+    assert s is not None
+    then, now = (t.programme.reference(2, ns(x)) for x in (5.0, 9.0))
+    expected = held(s, (then.position_ned_m, then.velocity_ned_m_s), now, ns(9.0), t.limits)
+    n = predicted(t, 9.0)[2]
+    assert (n.position_ned_m, n.velocity_ned_m_s) == expected
+
+
+# -- gates -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("velocity", "residual", "outlier"),
+    [
+        ((GATE_VELOCITY_M_S - 1e-6, 0.0), (0.0, 0.0), False),
+        ((GATE_VELOCITY_M_S + 1e-6, 0.0), (0.0, 0.0), True),
+        ((0.5, -0.5), (0.0, 0.0), True),
+        ((0.0, 0.0), (0.0, GATE_RESIDUAL_M - 1e-6), False),
+        ((0.0, 0.0), (0.0, GATE_RESIDUAL_M + 1e-6), True),
+        ((0.6, 0.0), (1.9, 0.0), False),
+        ((0.0, 0.0), (-1.5, 1.5), True),
+    ],
+)
+def test_gates_at_their_limits(velocity: tuple[float, float], residual: tuple[float, float], outlier: bool) -> None:
+    assert is_outlier(*velocity, *residual) is outlier
+
+
+def with_one_off(t: PeerTable, shift: Ned, drift: Ned) -> PeerTable:
+    for vehicle in (2, 3, 4, 5):
+        s = sample(t, vehicle, 10.0)
+        if vehicle == 3:
+            s = replace(
+                s, position_ned_m=Ned(*map(sum, zip(s.position_ned_m, shift, strict=True))),
+                velocity_ned_m_s=Ned(*map(sum, zip(s.velocity_ned_m_s, drift, strict=True))),
+            )  # fmt: skip
+        t.accept(message(s), at(10.0))
+    return t
+
+
+@pytest.mark.parametrize(
+    ("shift", "drift", "taking_part"),
+    [
+        (ZERO, ZERO, True),
+        (Ned(0.0, 1.99, 0.0), ZERO, True),
+        (Ned(0.0, 2.01, 0.0), ZERO, False),
+        (ZERO, Ned(0.0, 0.69, 0.0), True),
+        (ZERO, Ned(-0.71, 0.0, 0.0), False),
+        (Ned(0.0, 0.0, 9.0), Ned(0.0, 0.0, 3.0), True),  # altitude is not the law's
+    ],
+)
+def test_a_formed_vehicle_gates_a_peer_that_is_off(shift: Ned, drift: Ned, taking_part: bool) -> None:
+    t = with_one_off(table(), shift, drift)
+    gated = predicted(t, 10.0, gated=True)
+    assert gated[3].in_formation is taking_part
+    assert gated[3].shares_avoidance  # and it counts for separation as before
+    assert gated[3]._replace(in_formation=True) == predicted(t, 10.0)[3]
+    assert all(gated[k].in_formation for k in (2, 4, 5))
+
+
+def test_while_forming_nobody_is_gated() -> None:
+    t = with_one_off(table(), Ned(0.0, 30.0, 0.0), Ned(3.0, 0.0, 0.0))
+    assert all(n.in_formation for n in predicted(t, 10.0).values())
+
+
+def test_the_outer_slots_of_a_turning_formation_are_not_gated_for_their_speed() -> None:
+    """Vehicle 5 is 16 m behind: at 0.1 rad/s its slot moves at 1.6 m/s against the own one."""
+    turn = column_at_1_m_s(legs=(TurnLeg(0.1, inf),), heading_follows_turns=True)
+    t = table(turn)
+    for vehicle in (2, 3, 4, 5):
+        t.accept(message(sample(t, vehicle, 30.0)), at(30.0))
+    neighbours = predicted(t, 30.0, gated=True)
+    assert dist(neighbours[5].velocity_ned_m_s, turn.reference(OWN, ns(30.0)).velocity_ned_m_s) > 1.5
+    assert all(n.in_formation for n in neighbours.values())
+
+
+def test_gating_with_nobody_or_one_peer_gates_nobody() -> None:
+    assert predicted(table(), 1.0, gated=True) == {}
+    t = table()
+    s = sample(t, 2, 1.0)
+    t.accept(message(replace(s, position_ned_m=Ned(50.0, 0.0, 0.0))), at(1.0))
+    assert predicted(t, 1.0, gated=True)[2].in_formation
+
+
+# -- the lost --------------------------------------------------------------------------------------------------------
+
+
+def test_a_peer_goes_stale_just_after_its_time() -> None:
+    t = table()
+    t.accept(message(sample(t, 2, 0.0)), at(0.0))
+    fresh = predicted(t, 12.0)[2]
+    assert fresh.in_formation
+    assert fresh.uncertainty_m == 0.4
+    stale = predicted(t, 12.001)[2]
+    assert not stale.in_formation
+    assert not stale.shares_avoidance
+    assert t.phases()[2] is None
+
+
+def test_a_silent_peer_may_have_stopped_right_after_its_last_sample() -> None:
+    t = table()
+    s = sample(t, 2, 0.0)
+    t.accept(message(s), at(0.0))
+    n = predicted(t, 14.0)[2]
+    assert n.other_end_ned_m == pytest.approx(s.position_ned_m)
+    assert n.position_ned_m == pytest.approx(t.programme.reference(2, ns(14.0)).position_ned_m)
+    assert n.velocity_ned_m_s == pytest.approx((1.0, 0.0, 0.0))
+
+
+def test_a_peer_whose_presence_ended_flew_on_until_shortly_before() -> None:
+    t = table()
+    t.accept(message(sample(t, 2, 0.0)), at(0.0))
+    t.presence(2, False, at(6.0))
+    n = predicted(t, 8.0)[2]
+    stopped = t.programme.reference(2, ns(6.0 - PRESENCE_DELAY_S)).position_ned_m
+    assert n.other_end_ned_m == pytest.approx(stopped)
+    assert n.position_ned_m == pytest.approx(t.programme.reference(2, ns(8.0)).position_ned_m)
+    assert not n.shares_avoidance
+
+
+def test_a_peer_heard_just_before_its_end_did_not_stop_before_that() -> None:
+    t = table()
+    s = sample(t, 2, 5.8)
+    t.accept(message(s), at(5.8))
+    t.presence(2, False, at(6.0))
+    assert predicted(t, 6.0)[2].other_end_ned_m == pytest.approx(s.position_ned_m)
+
+
+def test_a_lost_peer_flies_on_no_longer_than_it_would_alone() -> None:
+    t = table()
+    t.accept(message(sample(t, 2, 0.0)), at(0.0))
+    t.presence(2, False, at(1.0))
+    last = t.programme.reference(2, ns(1.0 + LIMITS.isolated_flight_s)).position_ned_m
+    for seconds in (6.0, 7.0, 60.0):
+        n = predicted(t, seconds)[2]
+        assert n.position_ned_m == pytest.approx(last)
+        assert n.velocity_ned_m_s == ZERO
+
+
+@pytest.mark.parametrize("since_s", [0.0, 1.0, 3.0, 3.34, 60.0])
+def test_uncertainty_of_a_lost_peer_grows_to_its_cap(since_s: float) -> None:
+    t = table()
+    t.accept(message(sample(t, 2, 0.0)), at(0.0))
+    t.presence(2, False, at(1.0))
+    grown = min(UNCERTAINTY_GROWTH_M_S * since_s, UNCERTAINTY_GROWTH_MAX_M)
+    assert predicted(t, 1.0 + since_s)[2].uncertainty_m == pytest.approx(0.4 + grown)
+
+
+def test_a_lost_peer_is_a_neighbour_while_either_of_its_ends_is_in_range() -> None:
+    t = table(range_m=6.0)
+    t.accept(message(sample(t, 2, 0.0)), at(0.0))
+    t.presence(2, False, at(0.5))
+    now = at(20.0)
+    moment = t.programme.newest.moment(now.fleet_ns)
+    last, stopped = (t.programme.reference(2, ns(x)).position_ned_m for x in (5.5, 0.0))
+    beyond = Ned(last.north + 5.9, last.east, last.down)
+    behind = Ned(stopped.north - 5.9, stopped.east, stopped.down)
+    assert [len(t.predict(ego, now, moment, False)) for ego in (beyond, behind)] == [1, 1]
+    out = Ned(stopped.north - 6.1, stopped.east, stopped.down)
+    assert t.predict(out, now, moment, False) == []
+
+
+@pytest.mark.parametrize("phase", [Phase.LANDED, Phase.LANDING, Phase.RELEASED, Phase.CLIMBING])
+def test_a_lost_peer_that_was_not_in_formation_has_one_place(phase: Phase) -> None:
+    t = table()
+    t.accept(message(sample(t, 2, 0.0, phase, velocity_ned_m_s=ZERO)), at(0.0))
+    t.presence(2, False, at(1.0))
+    n = predicted(t, 30.0)[2]
+    assert n.other_end_ned_m is None
+    assert n.position_ned_m == t.programme.reference(2, ns(0.0)).position_ned_m
+
+
+def lost_by_presence() -> PeerTable:
+    t = table()
+    t.accept(message(sample(t, 2, 0.0), 1), at(0.0))
+    t.presence(2, False, at(6.0))
+    return t
+
+
+def test_a_lost_peer_comes_back_with_its_presence_or_a_new_message() -> None:
+    t = lost_by_presence()
+    t.presence(2, True, at(7.0))
+    assert predicted(t, 7.0)[2].in_formation
+    t = lost_by_presence()
+    t.accept(message(sample(t, 2, 7.0), 2), at(7.0))
+    assert predicted(t, 7.0)[2].in_formation
+    assert t.phases()[2] is Phase.FORMED
+    t = lost_by_presence()
+    t.accept(message(sample(t, 2, 5.0), 0, boot_id=8), at(7.0))  # restarted
+    assert predicted(t, 7.0)[2].in_formation
+
+
+def test_a_late_message_from_before_its_end_brings_nobody_back() -> None:
+    t = lost_by_presence()
+    assert t.accept(message(sample(t, 2, 5.5), 2), at(6.5)) is None
+    n = predicted(t, 7.0)[2]
+    assert not n.in_formation
+    assert n.other_end_ned_m == pytest.approx(t.programme.reference(2, ns(5.5)).position_ned_m)
+    assert t.phases()[2] is None
+
+
+@pytest.mark.parametrize(("seconds", "back"), [(5.9, False), (6.1, True)])
+def test_hearsay_brings_a_lost_peer_back_if_it_is_younger_than_the_loss(seconds: float, back: bool) -> None:
+    t = lost_by_presence()
+    t.accept(message(sample(t, 3, 7.0), digest=(sample(t, 2, seconds),)), at(7.0))
+    assert predicted(t, 7.0)[2].in_formation is back
+
+
+def test_hearsay_brings_a_silent_peer_back() -> None:
+    t = table()
+    t.accept(message(sample(t, 2, 0.0)), at(0.0))
+    assert not predicted(t, 13.0)[2].in_formation
+    t.accept(message(sample(t, 3, 13.0), digest=(sample(t, 2, 9.0),)), at(13.0))
+    n = predicted(t, 13.0)[2]
+    assert n.in_formation
+    assert n.other_end_ned_m is None
+
+
+def test_presence_of_strangers_is_counted_and_of_oneself_ignored() -> None:
+    t = table()
+    t.presence(99, True, at(0.0))
+    t.presence(OWN, False, at(0.0))
+    assert t.rejected == {"foreign id": 1}
+
+
+def test_silence_is_counted_from_the_last_peers_end() -> None:
+    t = table()
+    assert t.silent_for_s(at(0.0)) is None
+    assert t.oldest_age_s(at(0.0)) is None
+    for vehicle in (2, 3):
+        t.accept(message(sample(t, vehicle, float(vehicle))), at(4.0))
+    assert t.silent_for_s(at(5.0)) == 0.0
+    assert t.oldest_age_s(at(5.0)) == pytest.approx(3.0)
+    t.presence(2, False, at(6.0))
+    assert t.silent_for_s(at(7.0)) == 0.0
+    t.presence(3, False, at(8.0))
+    assert t.silent_for_s(at(10.5)) == pytest.approx(2.5)
+
+
+@PROPERTY
+@given(st.floats(-pi, pi), st.floats(0.0, 30.0), displacements)
+def test_predictions_turn_and_shift_with_the_whole_scene(angle: float, seconds: float, shift: Ned) -> None:
+    c, s = cos(angle), sin(angle)
+
+    def turned(v: Ned, by: Ned = ZERO) -> Ned:
+        return Ned(c * v.north - s * v.east + by.north, s * v.north + c * v.east + by.east, v.down + by.down)
+
+    plain = column_at_1_m_s()
+    moved = column_at_1_m_s(
+        centre_ned_m=turned(plain.centre_ned_m, shift), velocity_ned_m_s=turned(plain.velocity_ned_m_s),
+        heading_rad=angle,
+    )  # fmt: skip
+    results = []
+    for motion, is_moved in ((plain, False), (moved, True)):
+        t = table(motion)
+        p, v = Ned(3.0, 1.0, -9.0), Ned(1.3, 0.2, 0.1)
+        if is_moved:
+            p, v = turned(p, shift), turned(v)
+        t.accept(message(sample(t, 2, 1.0, position_ned_m=p, velocity_ned_m_s=v)), at(1.0))
+        results.append(predicted(t, 1.0 + seconds)[2])
+    a, b = results
+    assert b.position_ned_m == pytest.approx(turned(a.position_ned_m, shift), abs=1e-8)
+    assert b.velocity_ned_m_s == pytest.approx(turned(a.velocity_ned_m_s), abs=1e-9)
+    assert b.offset_ned_m == pytest.approx(turned(a.offset_ned_m), abs=1e-8)
