@@ -351,8 +351,9 @@ class Agent:
         if measured is None:
             return
         ego, bias = self._observe(measured, dt_s, now)
-        moment = self.programme.at(now.fleet_ns).moment(now.fleet_ns)
-        reference = moment.slot(self.programme.at(now.fleet_ns).slots[self.id])
+        motion = self.programme.at(now.fleet_ns)
+        moment = motion.moment(now.fleet_ns)
+        reference = moment.slot(motion.slots[self.id])
         neighbours = self.peers.predict(ego.position_ned_m, now, moment, self.phase is Phase.FORMED)
         residual = ZERO
         if self._steers():
@@ -363,7 +364,7 @@ class Agent:
                 self.setpoints_sent += 1
         self._settle(ego, reference, now)
         self._propose(now)
-        self._tell(now, residual)
+        self._tell(now, residual, reference)
         self._tick = self._outputs.tick = Tick(
             now,
             came,
@@ -575,7 +576,7 @@ class Agent:
         reference = self.programme.reference(self.id, sample.time_ns)
         return reference.position_ned_m, reference.velocity_ned_m_s
 
-    def _tell(self, now: Instant, residual: Ned) -> None:
+    def _tell(self, now: Instant, residual: Ned, reference: Reference) -> None:
         since_s = (now.monotonic_ns - self._sent_ns) * 1e-9
         due = bool(self._resend_ns) and now.monotonic_ns >= self._resend_ns[0]
         if due:
@@ -586,7 +587,7 @@ class Agent:
         position, velocity = Ned(*filtered[0]), Ned(*filtered[1])
         if not due and self._sent is not None:
             due = self._spacing.decide(
-                since_s, self._silence_limit_s, self._fires(position, velocity, residual, since_s, now)
+                since_s, self._silence_limit_s, self._fires(position, velocity, residual, since_s, reference, now)
             )
         if not due and self._sent is not None:
             return
@@ -600,10 +601,11 @@ class Agent:
         self._outputs.peers.append(("state", encode_state(message)))
         self.messages_sent += 1
 
-    def _fires(self, position: Ned, velocity: Ned, residual: Ned, since_s: float, now: Instant) -> bool:
+    def _fires(
+        self, position: Ned, velocity: Ned, residual: Ned, since_s: float, reference: Reference, now: Instant
+    ) -> bool:
         assert self._sent is not None
         sample, reference_then = self._sent
-        reference = self.programme.reference(self.id, now.fleet_ns)
         p, v = held(sample, reference_then, reference, now.fleet_ns, self.peers.limits)
         error_p = (position.north - p.north) ** 2 + (position.east - p.east) ** 2 + (position.down - p.down) ** 2
         error_v = (velocity.north - v.north) ** 2 + (velocity.east - v.east) ** 2 + (velocity.down - v.down) ** 2

@@ -112,6 +112,8 @@ class Options(NamedTuple):
     t_min: float
     t_max: float
     period: float
+    mode_by_residual: int
+    """1: E_i of Eq. (5) is read as the mean formation residual instead of the estimation error"""
     count_start: int
     """1: the first message is a message; 0: the start is known to all (the paper)"""
     leaderless: int
@@ -387,8 +389,10 @@ def fires(i: int, k: int, s: State, o: Options, et: ErrorTrigger, st: SwitchingT
             ec += a * a
         return anchor_exceeds(ec, res, it) or exceeds(ep, ev, 0.0, et)
     if kind == SWITCHING:
-        dynamic = math.sqrt(ep) + math.sqrt(ev) > st.eta
-        s.counts[2 if dynamic else 3] += 1
+        if o.mode_by_residual == 1:
+            s.counts[2 if math.sqrt(res) > st.eta else 3] += 1
+            return ep + st.gamma_s2 * ev >= switching_threshold(res, 0.0, t, st)
+        s.counts[2 if math.sqrt(ep) + math.sqrt(ev) > st.eta else 3] += 1
         return switching_exceeds(ep, ev, t, st)
     if kind == PERIODIC:
         steps = max(int(round(o.period / o.dt)), 1)

@@ -10,6 +10,7 @@ from sim.dynamics import DynamicsParameters, GustParameters, NoiseParameters
 from sim.stubs import StubFleetSettings, StubVehicleSettings
 
 LAND_ON_LOSS = 4
+POSITION_PERIOD_NS = 20_000_000
 FLEET_PARAMETERS: tuple[tuple[str, float | int], ...] = (
     ("COM_OBL_RC_ACT", LAND_ON_LOSS),
     ("COM_RC_OVERRIDE", 3),
@@ -31,7 +32,7 @@ def stub_settings(
     stub = config.stub
     random = Random(f"origins/{seed}")
     vehicles = []
-    for v in config.vehicles:
+    for k, v in enumerate(config.vehicles):
         way, angle = stub.origin_scatter_m * random.random(), 2.0 * pi * random.random()
         offset = Ned(way * cos(angle), way * sin(angle), 0.2 * stub.origin_scatter_m * (random.random() - 0.5))
         vehicles.append(
@@ -45,6 +46,7 @@ def stub_settings(
                     -v.pad_north_m, -v.pad_east_m, 0.0
                 ),
                 yaw_rad=radians(config.formation.heading_deg),
+                booted_before_ns=round(k / len(config.vehicles) * POSITION_PERIOD_NS),
                 parameters=FLEET_PARAMETERS,
             )
         )  # fmt: skip

@@ -61,6 +61,8 @@ class StubVehicleSettings:
     """where its estimator's origin lies relative to home, fleet frame"""
     yaw_rad: float = 0.0
     """heading at start"""
+    booted_before_ns: int = 0
+    """how much earlier than its host it booted: autopilots' streams are not in step with each other"""
     parameters: tuple[tuple[str, float | int], ...] = ()
     """PX4 parameters that differ from the default"""
 
@@ -159,7 +161,7 @@ def build_autopilot(
     """The stand-in of one vehicle as the settings describe it."""
     return Autopilot(
         system_id=vehicle.system_id,
-        boot_ns=boot_ns,
+        boot_ns=boot_ns - vehicle.booted_before_ns,
         utc_offset_ns=utc_offset_ns,
         fleet_origin=settings.fleet_origin,
         home_ned_m=vehicle.home_ned_m,

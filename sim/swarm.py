@@ -168,6 +168,8 @@ class Setup:
     delta_min: float = 0.01
     delta_f: float = 0.02
     eta: float = 0.3
+    mode_by_residual: bool = False
+    """switching: E_i read as the mean formation residual instead of |e_p| + |e_v|"""
     classic_sigma: float = 0.6
     classic_a: float = 0.3
     elastic_sigma: float = 0.1
@@ -432,6 +434,7 @@ def _options(setup: Setup) -> Any:
         t_min=setup.t_min_s,
         t_max=setup.t_max_s,
         period=setup.period_s,
+        mode_by_residual=int(setup.mode_by_residual),
         count_start=int(setup.count_start),
         leaderless=int(not setup.plan),
         intent=int(setup.law == "intent"),

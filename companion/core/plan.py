@@ -98,22 +98,23 @@ class _Centre(NamedTuple):
 
 
 def _velocity_leg(leg: VelocityLeg, p0: Ned, v0: Ned, t: float) -> _Centre:
-    dv = Ned(*(b - a for a, b in zip(v0, leg.velocity_ned_m_s, strict=True)))
-    ramp = _ramp_s(dv)
+    v1 = leg.velocity_ned_m_s
+    dn, de, dd = v1.north - v0.north, v1.east - v0.east, v1.down - v0.down
+    ramp = _ramp_s(Ned(dn, de, dd))
     x = min(t / ramp, 1.0) if ramp > 0.0 else 1.0
     level = x * x * (3.0 - 2.0 * x)
     area = ramp * (x * x * x - 0.5 * x**4) + (t - ramp * x)
     slope = 6.0 * x * (1.0 - x) / ramp if ramp > 0.0 else 0.0
     return _Centre(
-        Ned(*(p + v * t + d * area for p, v, d in zip(p0, v0, dv, strict=True))),
-        Ned(*(v + d * level for v, d in zip(v0, dv, strict=True))),
-        Ned(*(d * slope for d in dv)),
+        Ned(p0.north + v0.north * t + dn * area, p0.east + v0.east * t + de * area, p0.down + v0.down * t + dd * area),
+        Ned(v0.north + dn * level, v0.east + de * level, v0.down + dd * level),
+        Ned(dn * slope, de * slope, dd * slope),
         0.0, 0.0, 0.0,
     )  # fmt: skip
 
 
 def _ramp_s(dv: Ned) -> float:
-    return 1.5 * sqrt(sum(d * d for d in dv)) / PLAN_ACCELERATION_M_S2
+    return 1.5 * sqrt(dv.north * dv.north + dv.east * dv.east + dv.down * dv.down) / PLAN_ACCELERATION_M_S2
 
 
 def _turn_profile(leg: TurnLeg, t: float) -> tuple[float, float, float]:

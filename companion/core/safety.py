@@ -66,6 +66,16 @@ def safety_radius_m(neighbour_uncertainty_m: float) -> float:
     return COLLISION_DISTANCE_M + LAG_ALLOWANCE_M + neighbour_uncertainty_m
 
 
+def _share_of_segment(position: Ned, a: Ned, b: Ned) -> float:
+    """How far along from a (0) to b (1) the place nearest to us is, by the ellipsoid's measure of distance."""
+    north, east, down = b.north - a.north, b.east - a.east, (b.down - a.down) / DOWNWASH_RATIO**2
+    length2 = north * north + east * east + down * (b.down - a.down)
+    if length2 <= 1e-9:
+        return 0.0
+    along = (position.north - a.north) * north + (position.east - a.east) * east + (position.down - a.down) * down
+    return min(max(along / length2, 0.0), 1.0)
+
+
 def nearest_hypothesis(position: Ned, neighbour: Neighbour) -> tuple[Ned, Ned]:
     """Where on the line between a lost peer's two possible ends it is nearest to us, and how fast that point moves.
 
@@ -74,13 +84,14 @@ def nearest_hypothesis(position: Ned, neighbour: Neighbour) -> tuple[Ned, Ned]:
     a, v, b = neighbour.position_ned_m, neighbour.velocity_ned_m_s, neighbour.other_end_ned_m
     if b is None:
         return a, v
-    along = [b[k] - a[k] for k in range(3)]
-    length2 = sum(x * x for x in along)
-    share = sum((position[k] - a[k]) * along[k] for k in range(3)) / length2 if length2 > 1e-9 else 0.0
-    share = min(max(share, 0.0), 1.0)
+    share = _share_of_segment(position, a, b)
     moving = 1.0 - share
     return (
-        Ned(*(a[k] + share * along[k] for k in range(3))),
+        Ned(
+            a.north + share * (b.north - a.north),
+            a.east + share * (b.east - a.east),
+            a.down + share * (b.down - a.down),
+        ),
         Ned(moving * v.north, moving * v.east, moving * v.down),
     )
 
@@ -99,6 +110,8 @@ def half_plane(ego: VehicleState, shared_acceleration: Ned, neighbour: Neighbour
     z = (q.down - p.down) / DOWNWASH_RATIO
     vx, vy = w.north - v.north, w.east - v.east
     vz = (w.down - v.down) / DOWNWASH_RATIO
+    if neighbour.other_end_ned_m is not None:
+        vx, vy, vz = _across_segment(q, neighbour, vx, vy, vz)
     d = safety_radius_m(neighbour.uncertainty_m)
     s, t = shared_acceleration, neighbour.reference_acceleration_ned_m_s2
     return HalfPlane(
@@ -107,6 +120,20 @@ def half_plane(ego: VehicleState, shared_acceleration: Ned, neighbour: Neighbour
         ),
         neighbour.vehicle_id,
     )
+
+
+def _across_segment(position: Ned, neighbour: Neighbour, vx: float, vy: float, vz: float) -> tuple[float, float, float]:
+    """The part of a relative velocity (vertical divided by c) that changes the distance to a lost peer's segment.
+
+    Beside the segment the nearest place slides along with us, so that moving along it turns no distance: counted as
+    motion past a point it would seem to carry us away, and the filter would let us in.
+    """
+    a, b = neighbour.position_ned_m, neighbour.other_end_ned_m
+    if b is None or not 0.0 < _share_of_segment(position, a, b) < 1.0:
+        return vx, vy, vz
+    x, y, z = b.north - a.north, b.east - a.east, (b.down - a.down) / DOWNWASH_RATIO
+    along = (vx * x + vy * y + vz * z) / (x * x + y * y + z * z)
+    return vx - along * x, vy - along * y, vz - along * z
 
 
 def barrier(

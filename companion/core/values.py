@@ -37,8 +37,7 @@ FILTERED_PHASES = frozenset({Phase.FORMING, Phase.FORMED})
 """phases in which a vehicle's own safety filter steers it, so that a pair shares the avoidance"""
 
 
-@dataclass(frozen=True, slots=True)
-class VehicleState:
+class VehicleState(NamedTuple):
     """A vehicle's own state as its estimator tells it."""
 
     time_ns: int
@@ -47,8 +46,7 @@ class VehicleState:
     velocity_ned_m_s: Ned
 
 
-@dataclass(frozen=True, slots=True)
-class PeerSample:
+class PeerSample(NamedTuple):
     """One published state of a vehicle: its own, or another's passed on in a digest."""
 
     vehicle_id: int
@@ -100,8 +98,7 @@ class Neighbour(NamedTuple):
     reference_acceleration_ned_m_s2: Ned = ZERO
 
 
-@dataclass(frozen=True, slots=True)
-class Command:
+class Command(NamedTuple):
     """What the law asks for, before the safety filter."""
 
     acceleration_ned_m_s2: Ned
@@ -112,8 +109,7 @@ class Command:
     yaw_rad: float
 
 
-@dataclass(frozen=True, slots=True)
-class SafeSetpoint:
+class SafeSetpoint(NamedTuple):
     """What may be sent to an autopilot. Only `core.safety` makes one."""
 
     velocity_north_m_s: float

@@ -78,9 +78,17 @@ class Recorder:
     shows in `failure` and `lost`, and recording goes on when there is room again.
     """
 
-    def __init__(self, path: Path, metadata: Mapping[str, str], *, queue_capacity: int = QUEUE_CAPACITY) -> None:
+    def __init__(
+        self,
+        path: Path,
+        metadata: Mapping[str, str],
+        *,
+        queue_capacity: int = QUEUE_CAPACITY,
+        synchronise_interval_s: float = SYNCHRONISE_INTERVAL_S,
+    ) -> None:
         self._queue: deque[_Pending] = deque()
         self._capacity = queue_capacity
+        self._synchronise_interval_s = synchronise_interval_s
         self._sequence = 0
         self._refused = 0
         self._unwritten = 0
@@ -139,12 +147,12 @@ class Recorder:
         self._thread.join(CLOSE_TIMEOUT_S)
 
     def _run(self) -> None:
-        next_synchronisation_s = time.monotonic() + SYNCHRONISE_INTERVAL_S
+        next_synchronisation_s = time.monotonic() + self._synchronise_interval_s
         try:
             while not self._stop.wait(WRITE_INTERVAL_S):
                 self._write_waiting()
                 if time.monotonic() >= next_synchronisation_s:
-                    next_synchronisation_s = time.monotonic() + SYNCHRONISE_INTERVAL_S
+                    next_synchronisation_s = time.monotonic() + self._synchronise_interval_s
                     self._synchronise()
             self._write_waiting()
             self._finish()

@@ -159,6 +159,13 @@ class MavlinkLink:
             if whole and message_id not in _READ:
                 self.not_read += 1
                 return []
+            if whole:
+                try:
+                    event = self._event(self._in.decode(bytearray(datagram)))
+                except mavlink.MAVError:
+                    self.rejected["malformed"] += 1
+                    return []
+                return [] if event is None else [event]
         errors = self._in.total_receive_errors
         messages = self._in.parse_buffer(datagram) or []
         if self._in.total_receive_errors > errors or not messages:

@@ -275,7 +275,7 @@ class Commander:
         return THRUST_MIN_G if self.takeoff_state is TakeoffState.FLIGHT else 0.0
 
     def speed_up_limit_m_s(self, now_ns: int) -> float:
-        """Largest climb rate allowed now; during the take-off ramp it starts where the loop gives no thrust at all."""
+        """Largest climb rate allowed now; the take-off ramp begins where the loop gives no thrust at all."""
         limit_m_s = self._parameters.number("MPC_Z_VEL_MAX_UP")
         if self.takeoff_state is not TakeoffState.RAMPUP:
             return limit_m_s

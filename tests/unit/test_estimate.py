@@ -113,9 +113,7 @@ def test_velocity_reference_leads_by_the_leaking_integral_of_the_command() -> No
 
 @PROPERTY
 @given(
-    st.lists(
-        st.tuples(*[st.floats(-8, 8)] * 4, st.sampled_from([0.0, 0.02, 0.3, 5.0, 1e4])), min_size=1, max_size=20
-    )
+    st.lists(st.tuples(*[st.floats(-8, 8)] * 4, st.sampled_from([0.0, 0.02, 0.3, 5.0, 1e4])), min_size=1, max_size=20)
 )
 def test_velocity_reference_stays_near_the_measured_velocity(steps: list[tuple[float, ...]]) -> None:
     r = VelocityReference()

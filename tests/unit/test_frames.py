@@ -35,9 +35,7 @@ def test_a_place_comes_back_from_geodetic_to_a_millimetre(origin: Geodetic, plac
 def test_a_geodetic_point_comes_back_from_the_fleet_frame(
     origin: Geodetic, north_deg: float, east_deg: float, up_m: float
 ) -> None:
-    point = Geodetic(
-        origin.latitude_deg + north_deg, origin.longitude_deg + east_deg, origin.altitude_amsl_m + up_m
-    )
+    point = Geodetic(origin.latitude_deg + north_deg, origin.longitude_deg + east_deg, origin.altitude_amsl_m + up_m)
     back = ned_to_geodetic(geodetic_to_ned(point, origin), origin)
     assert back.latitude_deg == pytest.approx(point.latitude_deg, abs=1e-8)
     assert (back.longitude_deg - point.longitude_deg + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=1e-7)

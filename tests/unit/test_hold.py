@@ -71,9 +71,7 @@ def test_hold_moves_with_a_shifted_and_drifting_frame(
     """Damped: what the plan does besides is added to the prediction and to nothing else."""
     w = damped(tau_s, 0.7)
     x, xv = axis(p, v, ref, v_d, ref_now, v_now, w)
-    y, yv = axis(
-        p + shift, v + drift, ref + shift, v_d + drift, ref_now + shift + drift * tau_s, v_now + drift, w
-    )
+    y, yv = axis(p + shift, v + drift, ref + shift, v_d + drift, ref_now + shift + drift * tau_s, v_now + drift, w)
     assert y == pytest.approx(x + shift + drift * tau_s, abs=1e-8)
     assert yv == pytest.approx(xv + drift, abs=1e-9)
 

@@ -61,9 +61,7 @@ def scenes(draw: st.DrawFn, least: int = 0, most: int = 9) -> Scene:
 def command(s: Scene, g: Gains) -> Vector:
     sums = NO_SUMS
     for k in range(1, len(s.p)):
-        sums = add(
-            sums, pair(*map(float, (*(s.p[0] - s.p[k]), *(s.v[0] - s.v[k]), *(s.ref[0] - s.ref[k]))), g)
-        )
+        sums = add(sums, pair(*map(float, (*(s.p[0] - s.p[k]), *(s.v[0] - s.v[k]), *(s.ref[0] - s.ref[k]))), g))
     own = map(float, (*(s.p[0] - s.ref[0]), *(s.v[0] - s.v_d), *s.a_d))
     return np.array(finish(float(len(s.p) - 1), sums, *own, g))
 
@@ -161,9 +159,7 @@ def test_command_is_separation_and_the_largest_part_of_the_rest(scene: Scene) ->
         ((2.0, 0.0, 0.0), (1e-9, 0.0, 0.0), (2.0, 0.0, 0.0)),
     ],
 )
-def test_budget_of_known_cases(
-    sep: tuple[float, ...], rest: tuple[float, ...], expected: tuple[float, ...]
-) -> None:
+def test_budget_of_known_cases(sep: tuple[float, ...], rest: tuple[float, ...], expected: tuple[float, ...]) -> None:
     assert within_budget(*sep, *rest, 5.0) == pytest.approx(expected, abs=1e-8)
 
 

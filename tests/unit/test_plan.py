@@ -119,9 +119,7 @@ def test_legs_and_blends_meet_without_a_jump(m: Motion) -> None:
 
 @PROPERTY
 @given(motions, moments, st.lists(legs, max_size=2), st.sampled_from([None, True, False]))
-def test_other_legs_take_over_without_a_jump(
-    m: Motion, t_s: float, new: list[Leg], follows: bool | None
-) -> None:
+def test_other_legs_take_over_without_a_jump(m: Motion, t_s: float, new: list[Leg], follows: bool | None) -> None:
     after = with_legs(m, at_ns=ns(t_s), issuer=3, legs=tuple(new), heading_follows_turns=follows)
     assert (after.revision, after.start_ns, after.issuer) == (m.revision + 1, ns(t_s), 3)
     assert after.order > m.order

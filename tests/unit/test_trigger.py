@@ -80,7 +80,9 @@ def test_spacing_between_messages(since_s: float, silence_limit_s: float, fired:
     assert SPACING.decide(since_s, silence_limit_s, fired) is sends
 
 
-def fly(seed: int, kind: HoldKind, trigger: ErrorTrigger, spacing: Spacing, delay_ticks: int) -> tuple[float, float, int]:
+def fly(
+    seed: int, kind: HoldKind, trigger: ErrorTrigger, spacing: Spacing, delay_ticks: int
+) -> tuple[float, float, int]:
     """A vehicle pushed about at up to 2 m/s^2 on a plan at 1 m/s, and one receiver of its messages.
 
     Returns the largest squared trigger error just after a decision, the largest position error of the receiver over
