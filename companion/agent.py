@@ -23,6 +23,7 @@ from companion.core.plan import (
     Programme,
     Reference,
     assignment_matches,
+    top_speed_m_s,
     with_formation,
     with_legs,
 )
@@ -54,6 +55,12 @@ SETTLED_TOLERANCE_M = 0.6
 SETTLED_FOR_NS = 1_000_000_000
 ALTITUDE_TOLERANCE_M = 0.4
 CLIMB_LIMIT_NS = 60_000_000_000
+TAKE_OFF_LIMIT_NS = 10_000_000_000
+"""an autopilot that neither arms nor takes off within this is not asked any more"""
+HOLD_MARGIN_M = 1.0
+"""hold mode this far below the take-off's altitude is the pilot's doing, not the take-off's end"""
+OUR_MODES = frozenset({Px4Mode.AUTO_TAKEOFF, Px4Mode.AUTO_LOITER, Px4Mode.OFFBOARD})
+"""modes in which a vehicle may be while we fly it, but for landing"""
 RESEND_NS = (250_000_000, 1_000_000_000)
 """a change of phase or motion is repeated after these delays, since one message may be lost"""
 CATCH_UP_NS = 1_000_000_000
@@ -71,6 +78,11 @@ class Tick:
     neighbours: int
     nearest_m: float
     acceleration_m_s2: tuple[float, float]
+    steered: bool
+    """whether a setpoint was sent"""
+    position_ned_m: Ned
+    """own position and velocity as believed (fleet frame)"""
+    velocity_ned_m_s: Ned
 
 
 @dataclass(slots=True)
@@ -113,8 +125,13 @@ class Agent:
         self._bias = (BiasObserver(), BiasObserver(), BiasObserver())
         self._filter = (SendFilter(), SendFilter(), SendFilter())
         self._take_off_wanted = False
+        self._take_off_since_ns = 0
+        self._mode_before: int | None = None
+        """custom_mode at arming, until the take-off: the vehicle may stay in it"""
         self._position_came = False
         self._last_tick: Instant | None = None
+        self._observed_ns: int | None = None
+        """when the own state was last known"""
         self._tick: Tick | None = None
         self._sequence = 0
         self._sent: tuple[PeerSample, tuple[Ned, Ned]] | None = None
@@ -133,14 +150,19 @@ class Agent:
 
     # -- inputs ------------------------------------------------------------------------------------------------------
 
-    def receive_mavlink(self, datagram: bytes, now: Instant) -> None:
-        """Bytes of one datagram from the autopilot's link."""
+    def receive_mavlink(self, datagram: bytes, now: Instant) -> bool:
+        """Bytes of one datagram from the autopilot's link; tells whether it was our autopilot's heartbeat or position."""
+        heard = self.autopilot.heard
         if self.autopilot.receive(datagram, now):
             self._position_came = True
+        return self.autopilot.heard > heard
 
     def receive_peer(self, key: str, payload: bytes, now: Instant) -> None:
         """A peer's put: `fleet/<id>/state` or `fleet/<id>/plan`."""
         topic = key.rsplit("/", 1)[-1]
+        if topic not in ("state", "plan"):
+            self.rejected["peer: unknown topic"] += 1
+            return
         try:
             if topic == "plan":
                 self._consider(decode_motion(payload), now)
@@ -167,7 +189,7 @@ class Agent:
         try:
             command = json.loads(payload)
             verb = command["verb"]
-        except (ValueError, KeyError, TypeError):
+        except (ValueError, KeyError, TypeError, RecursionError):
             self.rejected["command: malformed"] += 1
             return self._reply("not a command: needs a JSON object with a verb")
         match verb:
@@ -204,11 +226,12 @@ class Agent:
         if reasons:
             return "; ".join(reasons)
         self._happened(PhaseEvent.TAKE_OFF, now)
-        self._take_off_wanted = True
+        self._take_off_wanted, self._take_off_since_ns = True, now.monotonic_ns
         return None
 
     def _command_land(self, now: Instant) -> str | None:
         self._take_off_wanted = False
+        self.autopilot.withdraw("arming", "take-off")
         if self.phase is Phase.RELEASED:
             return "the pilot has the vehicle"
         self._happened(PhaseEvent.LAND, now)
@@ -226,6 +249,8 @@ class Agent:
     def unready(self, now: Instant) -> list[str]:
         """Why this vehicle may not take off; empty when it may."""
         reasons = self.autopilot.unready(now)
+        if self.autopilot.armed and self.phase in (Phase.IDLE, Phase.LANDED) and not self._take_off_wanted:
+            reasons.append("armed by somebody else")
         silent = [i for i, phase in self.peers.phases().items() if phase is None]
         if silent:
             reasons.append(f"not heard: vehicle {', '.join(str(i) for i in silent)}")
@@ -240,7 +265,7 @@ class Agent:
             return None if known else f"revision {motion.revision} is not newer than {self.programme.newest.revision}"
         refusal = self._unsound(motion, now)
         if refusal is not None:
-            self.rejected[f"plan: {refusal}"] += 1
+            self.rejected[f"plan: {refusal.split(',')[0]}"] += 1
             return refusal
         self._adopt(motion, now)
         return None
@@ -250,8 +275,12 @@ class Agent:
             return "its vehicles are not this fleet's"
         if abs(motion.start_ns - now.fleet_ns) > 3_600_000_000_000:
             return "it starts more than an hour from now; are the clocks set?"
+        fastest = top_speed_m_s(motion)
+        if not fastest <= self.config.limits.speed_max_m_s:
+            return f"its centre flies at more than {self.config.limits.speed_max_m_s:g} m/s, at {fastest:.1f} m/s"
         if motion.shape == "pads":
-            return None
+            same = motion.slots == self.config.first_motion.slots
+            return None if same else "its pads are not this vehicle's; do the configurations differ?"
         try:
             slots = self.config.slots(motion.shape)
         except ConfigError as error:
@@ -350,18 +379,22 @@ class Agent:
         self._watch(now, measured is not None)
         if measured is None:
             return
-        ego, bias = self._observe(measured, dt_s, now)
+        gap_s = 0.0 if self._observed_ns is None else (now.monotonic_ns - self._observed_ns) * 1e-9
+        self._observed_ns = now.monotonic_ns
+        ego, bias = self._observe(measured, gap_s, now)
         motion = self.programme.at(now.fleet_ns)
         moment = motion.moment(now.fleet_ns)
         reference = moment.slot(motion.slots[self.id])
         neighbours = self.peers.predict(ego.position_ned_m, now, moment, self.phase is Phase.FORMED)
         residual = ZERO
+        steered = False
         if self._steers():
             command, residual = self._law(ego, reference, neighbours)
             setpoint = self.safety.apply(command, ego, neighbours, bias, dt_s)
             if setpoint is not None:
                 self._outputs.mavlink.append(self._encode(setpoint))
                 self.setpoints_sent += 1
+                steered = True
         self._settle(ego, reference, now)
         self._propose(now)
         self._tell(now, residual, reference)
@@ -372,6 +405,9 @@ class Agent:
             sum(n.in_formation for n in neighbours),
             min((dist(n.position_ned_m, ego.position_ned_m) for n in neighbours), default=-1.0),
             self.safety.acceleration_m_s2,
+            steered,
+            ego.position_ned_m,
+            ego.velocity_ned_m_s,
         )
 
     def _steers(self) -> bool:
@@ -436,14 +472,20 @@ class Agent:
     # -- phases ------------------------------------------------------------------------------------------------------
 
     def _happened(self, event: PhaseEvent, now: Instant) -> None:
-        after = next_phase(self.phase, event)
-        if after is self.phase:
+        before, after = self.phase, next_phase(self.phase, event)
+        if after is before:
             return
         self._outputs.notes.append(f"{self.phase.name.lower()} -> {after.name.lower()}: {event.value}")
         self.phase = after
         self._phase_since_ns = now.monotonic_ns
+        if after is Phase.ARMED:
+            self._mode_before = self.autopilot.custom_mode
+        elif before is not Phase.ARMED:
+            self._mode_before = None
         self._settled_since_ns = None
         self._mode_asked_ns = 0
+        # A retry of what has happened would happen again: over the pilot's head, at worst.
+        self.autopilot.withdraw("arming", "take-off", Px4Mode.OFFBOARD.name)
         if after is Phase.FORMING and event is PhaseEvent.ENGAGED:
             self.safety.reset()
             self._formation_since_ns = now.fleet_ns
@@ -466,6 +508,10 @@ class Agent:
                 if self._take_off_wanted:
                     if ap.armed:
                         self._happened(PhaseEvent.ARMED, now)
+                    elif now.monotonic_ns - self._take_off_since_ns > TAKE_OFF_LIMIT_NS:
+                        self._take_off_wanted = False
+                        ap.withdraw("arming")
+                        self._failsafe("autopilot does not arm: take-off given up")
                     else:
                         ap.ask("arming", *wire.arm_parameters(True))
             case Phase.ARMED:
@@ -474,6 +520,11 @@ class Agent:
                     self._happened(PhaseEvent.DISARMED, now)
                 elif ap.custom_mode == Px4Mode.AUTO_TAKEOFF:
                     self._happened(PhaseEvent.TAKING_OFF, now)
+                elif ap.custom_mode not in OUR_MODES and ap.custom_mode != self._mode_before:
+                    self._happened(PhaseEvent.TAKEN_OVER, now)
+                elif now.monotonic_ns - self._phase_since_ns > TAKE_OFF_LIMIT_NS:
+                    self._failsafe("autopilot does not take off: landing")
+                    self._happened(PhaseEvent.LAND, now)
                 else:
                     altitude = self.config.origin.altitude_amsl_m + self.config.formation.altitude_m
                     if self.config.fleet.frame == "local":
@@ -503,6 +554,10 @@ class Agent:
             self._happened(PhaseEvent.TAKEN_OVER, now)
             return
         height = self.config.formation.altitude_m
+        low = self.config.fleet.frame == "global" and -ap.position_ned_m.down < height - HOLD_MARGIN_M
+        if ap.custom_mode == Px4Mode.AUTO_LOITER and low and not self._mode_asked_ns:
+            self._happened(PhaseEvent.TAKEN_OVER, now)
+            return
         reached = -ap.position_ned_m.down > height - ALTITUDE_TOLERANCE_M
         if self._mode_asked_ns or reached or ap.custom_mode == Px4Mode.AUTO_LOITER:
             if not self._mode_asked_ns:
@@ -548,8 +603,10 @@ class Agent:
             self._land_seen = True
         elif self._land_seen:
             # On disarming PX4 falls back to the mode before, which the heartbeat tells a second later.
-            if ap.custom_mode != Px4Mode.OFFBOARD:
+            if ap.custom_mode not in (Px4Mode.OFFBOARD, self._mode_before):
                 self._happened(PhaseEvent.TAKEN_OVER, now)
+        elif ap.custom_mode not in OUR_MODES and ap.custom_mode != self._mode_before:
+            self._happened(PhaseEvent.TAKEN_OVER, now)
         else:
             ap.set_mode(Px4Mode.AUTO_LAND)
 

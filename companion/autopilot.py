@@ -25,7 +25,7 @@ ESTIMATOR_FLAGS_NEEDED = 1 | 2 | 4
 ESTIMATOR_GLOBAL_FLAG = 16
 """absolute horizontal position"""
 ESTIMATOR_RELATIVE_FLAG = 8
-ACCEPTED, TEMPORARILY_REJECTED = 0, 1
+ACCEPTED, TEMPORARILY_REJECTED, IN_PROGRESS = 0, 1, 5
 
 
 @dataclass(slots=True)
@@ -34,6 +34,8 @@ class _Request:
     make: Callable[[], bytes]
     tries: int = 0
     next_ns: int = 0
+    withdrawn: bool = False
+    """asked, and wanted no longer: it waits for its answer only"""
 
 
 @dataclass(slots=True)
@@ -70,6 +72,8 @@ class AutopilotClient:
     def __init__(self, link: MavlinkLink, fleet_origin: Geodetic | None) -> None:
         self.link = link
         self.counts: Counter[str] = Counter()
+        self.heard = 0
+        """heartbeats and positions so far: what proves that it is our autopilot that speaks"""
         self.notes: list[str] = []
         """what happened, for the log; emptied by the agent"""
         self.fleet_origin = fleet_origin
@@ -90,17 +94,23 @@ class AutopilotClient:
         """fleet frame"""
         self.velocity_ned_m_s = ZERO
         self._queues: dict[int, deque[_Request]] = {}
+        self._refused: dict[str, int] = {}
+        """name of a request -> when it may be asked again after a refusal (monotonic ns)"""
+        self._now_ns = 0
         self._next_heartbeat_ns = 0
         self._next_origin_ns = 0
 
     def receive(self, datagram: bytes, now: Instant) -> bool:
         """Take a datagram; True if it brought a position."""
+        self._now_ns = now.monotonic_ns
         fresh = False
         for event in self.link.decode(datagram):
             match event:
                 case wire.LocalPosition():
+                    self.heard += 1
                     fresh = self._position(event, now) or fresh
                 case wire.Heartbeat():
+                    self.heard += 1
                     self._heartbeat(event, now)
                 case wire.CurrentMode():
                     self.custom_mode = event.custom_mode
@@ -171,17 +181,20 @@ class AutopilotClient:
             self.counts["answer to nothing asked"] += 1
             return
         request = queue[0]
-        if event.result == TEMPORARILY_REJECTED and request.tries < TRIES:
+        if event.result in (TEMPORARILY_REJECTED, IN_PROGRESS) and request.tries < TRIES:
             request.next_ns = now.monotonic_ns + round(RETRY_S * 1e9)
             return
         queue.popleft()
         if event.result != ACCEPTED:
+            self._refused[request.name] = now.monotonic_ns + round(RETRY_S * 1e9)
             self.counts[f"refused: {request.name.split()[0]}"] += 1
             if not request.name.startswith("stream"):
                 self.notes.append(f"autopilot refused {request.name} (result {event.result})")
 
     def ask(self, name: str, command: int, *parameters: float) -> None:
-        """Ask for a command, retried until answered; the same name is not queued twice."""
+        """Ask for a command, retried until answered; the same name is not queued twice, nor right after a refusal."""
+        if self._now_ns < self._refused.get(name, 0):
+            return
         queue = self._queues.setdefault(command, deque())
         if all(r.name != name for r in queue):
             queue.append(_Request(name, lambda: self.link.command(command, *parameters)))
@@ -194,12 +207,22 @@ class AutopilotClient:
             queue.clear()
         self.ask(mode.name, command, *parameters)
 
+    def withdraw(self, *names: str) -> None:
+        """Ask no more for what is wanted no longer, or was seen to be done though its answer was lost."""
+        for queue in self._queues.values():
+            for request in [r for r in queue if r.name in names]:
+                if request.tries == 0:
+                    queue.remove(request)
+                else:
+                    request.tries, request.withdrawn = TRIES, True
+
     def cancel(self) -> None:
         """Ask for nothing more: the vehicle is somebody else's now."""
         self._queues.clear()
 
     def due(self, now: Instant) -> list[bytes]:
         """Datagrams to send now: heartbeat at 1 Hz, requests with their retries."""
+        self._now_ns = now.monotonic_ns
         out = []
         if now.monotonic_ns >= self._next_heartbeat_ns:
             out.append(self.link.heartbeat())
@@ -211,8 +234,10 @@ class AutopilotClient:
             out.append(self.link.command(*wire.request_message_parameters(wire.ORIGIN_MESSAGE_ID)))
         for queue in self._queues.values():
             while queue and queue[0].tries >= TRIES and now.monotonic_ns >= queue[0].next_ns:
-                self.counts["unanswered"] += 1
-                self.notes.append(f"autopilot never answered {queue.popleft().name}")
+                request = queue.popleft()
+                if not request.withdrawn:
+                    self.counts["unanswered"] += 1
+                    self.notes.append(f"autopilot never answered {request.name}")
             if queue and now.monotonic_ns >= queue[0].next_ns:
                 queue[0].tries += 1
                 queue[0].next_ns = now.monotonic_ns + round(RETRY_S * 1e9)

@@ -18,6 +18,7 @@ from urllib.parse import urlsplit
 
 import annotated_types
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic.fields import FieldInfo
 
 from companion.core.formation import SHAPES, Slots, centred, minimum_distance, rotated, shape_slots
 from companion.core.frames import Geodetic, Ned
@@ -31,12 +32,19 @@ from companion.core.trigger import ErrorTrigger, Spacing, SwitchingTrigger, Trig
 from companion.core.values import ZERO
 from companion.errors import ConfigError
 
-Real = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Real = Annotated[float, Field(ge=-1e5, le=1e5, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, le=1e5, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, le=1e5, allow_inf_nan=False)]
+Gain = Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 VehicleId = Annotated[int, Field(ge=1, le=250)]
 
+PLAN_SPEED_SHARE = 0.75
+"""part of the speed limits that the plan may ask for; the rest is left to keep up with it"""
+TURN_RATE_MIN_DEG_S = 0.01
+"""slower turns are refused: their arcs are straight lines to a double's precision"""
+ALTITUDE_MIN_M = 1.0
+"""no slot lower than this above the fleet origin"""
 SPACING_MARGIN_M = 0.2
 """slots stay this much farther apart than separation and barrier begin to act"""
 LOOP_LATENCY_S = 0.12
@@ -102,7 +110,7 @@ class GotoLegTable(_Table):
     north_m: Real
     east_m: Real
     altitude_m: Annotated[float, Field(ge=1, le=500, allow_inf_nan=False)] | None = None
-    speed_m_s: Positive = 1.0
+    speed_m_s: Annotated[float, Field(ge=0.1, le=12, allow_inf_nan=False)] = 1.0
 
 
 LegTable = Annotated[HoldLegTable | VelocityLegTable | TurnLegTable | GotoLegTable, Field(discriminator="kind")]
@@ -125,13 +133,13 @@ class LawTable(_Table):
     kind: Literal["starling", "paper"] = "starling"
     hold: HoldKind = "damped"
     hold_damping_s: Positive = 0.7
-    k_s: NotNegative = 3.0
-    k_a: NotNegative = 3.0
-    k_c: NotNegative = 4.0
-    k_v: NotNegative = 1.0
-    k_p: NotNegative = 0.3
+    k_s: Gain = 3.0
+    k_a: Gain = 3.0
+    k_c: Gain = 4.0
+    k_v: Gain = 1.0
+    k_p: Gain = 0.3
     a_max_m_s2: Annotated[float, Field(gt=0, le=20, allow_inf_nan=False)] = 5.0
-    r0_m: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+    r0_m: Annotated[float, Field(ge=0.1, le=1000, allow_inf_nan=False)] | None = None
     """range of separation; None: half the spacing"""
 
 
@@ -156,7 +164,7 @@ class TriggerTable(_Table):
 class LimitsTable(_Table):
     """Limits on every setpoint, and what the vehicles are assumed to measure."""
 
-    speed_max_m_s: Annotated[float, Field(gt=0, le=12, allow_inf_nan=False)] = 4.0
+    speed_max_m_s: Annotated[float, Field(ge=0.2, le=12, allow_inf_nan=False)] = 4.0
     climb_max_m_s: Annotated[float, Field(gt=0, le=3, allow_inf_nan=False)] = 1.5
     descent_max_m_s: Annotated[float, Field(gt=0, le=1.5, allow_inf_nan=False)] = 1.0
     jerk_max_m_s3: Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)] = 100.0
@@ -371,6 +379,11 @@ class FleetConfig(_Table):
         else:
             raise ConfigError(f"$.formation.shape must be one of {', '.join((*SHAPES, 'custom'))}, got {shape!r}")
         self._check_slots(shape, slots)
+        lowest = self.formation.altitude_m - max(s.down for s in slots)
+        if lowest < ALTITUDE_MIN_M:
+            raise ConfigError(
+                f"$.formation.altitude_m: {shape!r} must have no slot below {ALTITUDE_MIN_M:g} m, got {lowest:.2f}"
+            )
         return slots
 
     def _check_slots(self, shape: str, slots: Slots) -> None:
@@ -455,9 +468,14 @@ def companion_port(instance: int) -> int:
     return 14540 + instance if instance < 10 else 24540 + instance
 
 
-def autopilot_port(instance: int) -> int:
-    """UDP port from which the autopilot of an instance sends."""
-    return 14580 + instance if instance < 10 else 25540 + instance
+def autopilot_port(instance: int, companion: int | None = None) -> int:
+    """UDP port from which the autopilot of an instance sends: 40 above its companion's for the first ten, then 1000.
+
+    `companion` is the companion's port where it is not the instance's own: a fleet whose URLs are shifted has its
+    autopilots shifted alike, so that several fit on one machine.
+    """
+    listening = companion_port(instance) if companion is None else companion
+    return listening + (40 if instance < 10 else 1000)
 
 
 def udp_endpoint(url: str) -> tuple[str, int] | None:
@@ -504,7 +522,8 @@ def parse(tables: Mapping[str, Any], name: str) -> FleetConfig:
     try:
         config = FleetConfig.model_validate_json(json.dumps(tables, default=str))
     except ValidationError as error:
-        raise ConfigError("\n".join(f"{name}: {_sentence(e)}" for e in error.errors())) from error
+        sentences = dict.fromkeys(_sentence(e) for e in error.errors())
+        raise ConfigError("\n".join(f"{name}: {sentence}" for sentence in sentences)) from error
     faults = list(_faults(config))
     if not faults:
         try:
@@ -533,7 +552,8 @@ def _faults(config: FleetConfig) -> Iterator[str]:
         values.append(("mavlink", ("port", udp[1]) if udp else ("device", serial[0] if serial else link)))
         if v.zenoh is not None:
             values.append(("zenoh", v.zenoh))
-            if not re.fullmatch(r"(tcp|udp|tls|quic)/.+:\d+", v.zenoh):
+            endpoint = re.fullmatch(r"(tcp|udp|tls|quic)/.+:(\d{1,5})", v.zenoh)
+            if endpoint is None or not 0 < int(endpoint[2]) < 65536:
                 yield f"$.vehicle[{k}].zenoh must be PROTOCOL/HOST:PORT with tcp, udp, tls or quic, got {v.zenoh!r}"
         if v.slot != "auto":
             values.append(("slot", v.slot))
@@ -551,14 +571,47 @@ def _faults(config: FleetConfig) -> Iterator[str]:
             f"$.launch.spacing_m / $.vehicle[].pad_m: pads must be at least the safety radius "
             f"{config.safety_radius_m:.2f} m apart, got {minimum_distance(pads):.2f} m"
         )
-    speed = config.limits.speed_max_m_s
+    if config.trigger.t_min_s >= config.trigger.t_max_s:
+        yield (
+            f"$.trigger.t_min_s must be below $.trigger.t_max_s = {config.trigger.t_max_s:g} s, "
+            f"got {config.trigger.t_min_s:g}"
+        )
+    yield from _plan_faults(config)
+
+
+def _plan_faults(config: FleetConfig) -> Iterator[str]:
+    """Legs that ask for more than the limits leave, or lead into the ground."""
+    limits = config.limits
+    altitude_m = config.formation.altitude_m
+    level = PLAN_SPEED_SHARE * limits.speed_max_m_s
     for k, leg in enumerate(config.plan.legs):
-        if isinstance(leg, VelocityLegTable) and sqrt(leg.north_m_s**2 + leg.east_m_s**2) > 0.75 * speed:
-            yield f"$.plan.legs[{k}]: speed must be <= {0.75 * speed:g} m/s (3/4 of $.limits.speed_max_m_s)"
-        if isinstance(leg, TurnLegTable) and leg.rate_deg_s == 0:
-            yield f"$.plan.legs[{k}].rate_deg_s must not be 0 deg/s"
-        if isinstance(leg, TurnLegTable) and leg.angle_deg is None and k + 1 < len(config.plan.legs):
-            yield f"$.plan.legs[{k}].angle_deg is required except in the last leg"
+        where = f"$.plan.legs[{k}]"
+        match leg:
+            case VelocityLegTable():
+                speed = sqrt(leg.north_m_s**2 + leg.east_m_s**2)
+                if speed > level:
+                    yield f"{where}: speed must be <= {level:g} m/s (3/4 of $.limits.speed_max_m_s), got {speed:g}"
+                most, least = PLAN_SPEED_SHARE * limits.climb_max_m_s, -PLAN_SPEED_SHARE * limits.descent_max_m_s
+                if not least <= leg.up_m_s <= most:
+                    yield (
+                        f"{where}.up_m_s must be >= {least:g} and <= {most:g} m/s "
+                        f"(3/4 of $.limits.descent_max_m_s and climb_max_m_s), got {leg.up_m_s:g}"
+                    )
+                altitude_m += leg.up_m_s * leg.duration_s
+                if altitude_m < ALTITUDE_MIN_M:
+                    yield f"{where}: must end at least {ALTITUDE_MIN_M:g} m above the origin, got {altitude_m:g}"
+            case TurnLegTable():
+                if abs(leg.rate_deg_s) < TURN_RATE_MIN_DEG_S:
+                    yield f"{where}.rate_deg_s must be {TURN_RATE_MIN_DEG_S:g} deg/s or more, got {leg.rate_deg_s:g}"
+                if leg.angle_deg is None and k + 1 < len(config.plan.legs):
+                    yield f"{where}.angle_deg is required except in the last leg"
+            case GotoLegTable():
+                if leg.speed_m_s > level:
+                    yield (
+                        f"{where}.speed_m_s must be <= {level:g} m/s (3/4 of $.limits.speed_max_m_s), "
+                        f"got {leg.speed_m_s:g}"
+                    )
+                altitude_m = altitude_m if leg.altitude_m is None else leg.altitude_m
 
 
 _UNITS = {
@@ -569,40 +622,54 @@ _UNITS = {
 
 def _sentence(error: Any) -> str:
     """One fault as a sentence: where, what is allowed, what came."""
-    kinds = {"hold", "velocity", "turn", "goto"}
-    loc = [p for k, p in enumerate(error["loc"]) if not (p in kinds and k >= 3 and error["loc"][0] == "plan")]
+    loc = [p for k, p in enumerate(error["loc"]) if not (p in _LEGS and k >= 3 and error["loc"][0] == "plan")]
+    if "slot" in loc:
+        # The two kinds of value that a slot may have are two faults to the validator.
+        loc = loc[: loc.index("slot") + 1]
     path = "$" + "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in loc)
     came = error["input"]
     match error["type"]:
         case "extra_forbidden":
-            return f"{path} is not a known key; known here: {', '.join(_known(error['loc'][:-1]))}"
+            return f"{path} is not a known key; known here: {', '.join(sorted(_place(error['loc'][:-1])[0]))}"
+        case "too_short":
+            return f"{path} must have at least {error['ctx']['min_length']}, got {error['ctx']['actual_length']}"
         case "missing":
             return f"{path} is required"
         case "string_pattern_mismatch":
             return f"{path} must match {error['ctx']['pattern']}, got {came!r}"
         case "union_tag_invalid" | "union_tag_not_found":
             return f"{path}.kind must be one of hold, velocity, turn, goto, got {came!r}"
-    unit = next((u for s, u in _UNITS.items() if str(loc[-1]).endswith(s)), "")
-    allowed = _allowed(error["loc"])
+    unit = next((u for s, u in _UNITS.items() if str(loc[-1]).endswith(s)), "") if loc[-1] != "k_s" else ""
+    allowed = _allowed(tuple(loc) if "slot" in loc else error["loc"])
     message = error["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
     rule = f"must be {allowed} {unit}".rstrip() if allowed else f"must be {message}"
     return f"{path} {rule}, got {came!r}"
 
 
-def _field(loc: tuple[Any, ...]) -> Any:
-    table: Any = FleetConfig
-    field: Any = None
+_LEGS: Mapping[str, type[_Table]] = {
+    "hold": HoldLegTable, "velocity": VelocityLegTable, "turn": TurnLegTable, "goto": GotoLegTable
+}  # fmt: skip
+
+
+def _place(loc: Sequence[str | int]) -> tuple[Mapping[str, FieldInfo], FieldInfo | None]:
+    """The fields of the table at a place of the file, and the field that the place itself is."""
+    fields: Mapping[str, FieldInfo] = FleetConfig.model_fields
+    field: FieldInfo | None = None
     for part in loc:
-        if isinstance(part, int) or part in ("hold", "velocity", "turn", "goto"):
+        if isinstance(part, int):
             continue
-        if not isinstance(table, type) or not issubclass(table, BaseModel) or part not in table.model_fields:
-            return None
-        field = table.model_fields[part]
-        table = _inner(field.annotation)
-    return field
+        if part in fields:
+            field = fields[part]
+            table = _inner(field.annotation)
+            fields = {} if table is None else table.model_fields
+        elif part in _LEGS:
+            fields = _LEGS[part].model_fields
+        else:
+            return {}, None
+    return fields, field
 
 
-def _inner(annotation: Any) -> Any:
+def _inner(annotation: Any) -> type[BaseModel] | None:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     for argument in getattr(annotation, "__args__", ()):
@@ -612,20 +679,28 @@ def _inner(annotation: Any) -> Any:
     return None
 
 
-def _known(loc: tuple[Any, ...]) -> list[str]:
-    field = _field(loc)
-    table = FleetConfig if not loc else _inner(field.annotation) if field is not None else None
-    return sorted(table.model_fields) if table is not None else []
+def _scalars(annotation: Any) -> Iterator[Any]:
+    """The types inside an annotation, each with what restricts it: (type, restrictions)."""
+    if annotation is float or annotation is int:
+        yield annotation, ()
+    elif hasattr(annotation, "__metadata__"):
+        for scalar, _ in _scalars(annotation.__origin__):
+            yield scalar, annotation.__metadata__
+    else:
+        for argument in getattr(annotation, "__args__", ()):
+            yield from _scalars(argument)
 
 
-def _allowed(loc: tuple[Any, ...]) -> str:
+def _allowed(loc: Sequence[str | int]) -> str:
     """The range of a numeric field, as 'a finite number > 0'."""
-    field = _field(loc)
+    _, field = _place(loc)
     if field is None:
         return ""
-    items = [*field.metadata]
-    for argument in getattr(field.annotation, "__args__", ()):
-        items += getattr(argument, "__metadata__", ())
+    scalars = list(_scalars(field.annotation))
+    if not scalars:
+        return ""
+    kind, restrictions = scalars[0]
+    items = [*field.metadata, *restrictions]
     bounds = []
     for item in [*items, *(m for i in items for m in getattr(i, "metadata", ()))]:
         match item:
@@ -637,7 +712,6 @@ def _allowed(loc: tuple[Any, ...]) -> str:
                 bounds.append(f"< {item.lt:g}")
             case annotated_types.Le():
                 bounds.append(f"<= {item.le:g}")
-    if field.annotation is float or bounds:
-        kind = "a whole number" if field.annotation is int else "a finite number"
-        return " ".join([kind, " and ".join(dict.fromkeys(bounds))]).rstrip()
-    return ""
+    name = "a whole number" if kind is int else "a finite number"
+    text = " ".join([name, " and ".join(dict.fromkeys(bounds))]).rstrip()
+    return f'{text}, or "auto"' if "auto" in str(field.annotation) else text

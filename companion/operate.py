@@ -93,9 +93,7 @@ class Operator:
     def form(self, shape: str, now_ns: int) -> Answers:
         """Another formation; RefusedError if nobody says where the fleet is, ConfigError for an unknown shape."""
         slots = self.config.slots(shape)
-        newest = self._newest()
-        if newest.revision == 0 and newest.shape == "pads" and self.config.plan.automatic:
-            raise RefusedError("the fleet is not in formation yet")
+        newest = self._formed()
         motion = with_formation(
             newest, at_ns=self._start_ns(newest, now_ns), issuer=0, shape=shape, slots=slots,
             pinned=self.config.pinned, speed_m_s=self.config.limits.speed_max_m_s / 2,
@@ -103,13 +101,13 @@ class Operator:
         return self._send(motion)
 
     def move(self, leg: Leg, now_ns: int) -> Answers:
-        """Another motion of the formation."""
-        newest = self._newest()
+        """Another motion of the formation; RefusedError before it has formed by itself."""
+        newest = self._formed()
         return self._send(with_legs(newest, at_ns=self._start_ns(newest, now_ns), issuer=0, legs=(leg,)))
 
     def goto(self, north_m: float, east_m: float, altitude_m: float | None, speed_m_s: float, now_ns: int) -> Answers:
         """Fly the formation's centre to a point of the fleet frame and stop there."""
-        newest = self._newest()
+        newest = self._formed()
         start_ns = self._start_ns(newest, now_ns)
         here = newest.moment(start_ns).centre.position
         target = Ned(north_m, east_m, here.down if altitude_m is None else -altitude_m)
@@ -120,6 +118,13 @@ class Operator:
     def hold(self, now_ns: int) -> Answers:
         """Stop where the formation is."""
         return self.move(VelocityLeg(ZERO, 0.0), now_ns)
+
+    def _formed(self) -> Motion:
+        newest = self._newest()
+        if newest.revision == 0 and self.config.plan.automatic:
+            # A motion of ours would take the place of the one by which the vehicles form.
+            raise RefusedError("the fleet is not in formation yet")
+        return newest
 
     def _newest(self) -> Motion:
         motions = []

@@ -37,7 +37,10 @@ def replay_file(path: Path) -> ReplayResult:
     """Replay one recording; CompanionError if the file is none."""
     import tomllib
 
-    recording = read_recording(path)
+    try:
+        recording = read_recording(path)
+    except OSError as error:
+        raise CompanionError(f"{path}: cannot be read: {error.strerror}") from error
     try:
         facts = recording.metadata
         config = parse(tomllib.loads(facts["config"]), path.name)

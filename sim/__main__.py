@@ -95,7 +95,8 @@ def up(
     duration: Annotated[
         float | None, typer.Option("--for", min=1, help="Seconds from take-off to the landing command.")
     ] = None,
-    autopilot: Annotated[str, typer.Option(help="What flies: stub.")] = "stub",
+    autopilot: Annotated[str, typer.Option(help="What flies: stub, px4 (SITL) or external (runs already).")] = "stub",
+    px4: Annotated[Path | None, typer.Option(help="With --autopilot px4: PX4's build folder.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of gusts, noise and estimator origins.")] = 0,
     calm: Annotated[bool, typer.Option("--calm", help="No gusts and no sensor noise.")] = False,
     out: Annotated[Path, typer.Option(help="Folder for the flight's folder.")] = Path("flights"),
@@ -106,17 +107,28 @@ def up(
     Ctrl-C lands the fleet. Exit status: 0 the flight met its criteria, 1 it did not, 2 wrong usage or configuration.
     """
     from sim.launch import FlightOptions, flight_folder, fly
+    from sim.sitl import check_build
+    from sim.stub_fleet import check_stub_links
     from sim.view import FlightView, show_summary
 
-    if autopilot != "stub":
-        raise ConfigError(f"--autopilot must be stub, got {autopilot!r}")
+    if autopilot not in ("stub", "px4", "external"):
+        raise ConfigError(f"--autopilot must be stub, px4 or external, got {autopilot!r}")
+    if (autopilot == "px4") != (px4 is not None):
+        raise ConfigError(
+            "--autopilot px4 needs --px4 BUILD_DIR (get PX4-Autopilot v1.16 from its project, run "
+            "`make px4_sitl_default` and pass build/px4_sitl_default), and --px4 needs --autopilot px4"
+        )
+    if px4 is not None:
+        px4 = check_build(px4)
     tables = _tables(fleet, vehicles, formation, plan)
     if calm:
         tables.setdefault("stub", {}).update(position_noise_m=0.0, velocity_noise_m_s=0.0, gust_m_s2=0.0)
     from companion.config import parse
 
-    parse(tables, fleet.name)
-    options = FlightOptions(flight_folder(out), seed, duration)
+    config = parse(tables, fleet.name)
+    if autopilot == "stub":
+        check_stub_links(config)
+    options = FlightOptions(flight_folder(out), seed, duration, px4, autopilot == "external")
     interrupted = _interrupts()
     with FlightView(quiet=as_json) as view:
         summary = fly(tables, options, view.show, interrupted)
@@ -145,12 +157,16 @@ def stub(
         bool, typer.Option("--launched", help="End when standard input closes: for launchers.")
     ] = False,
 ) -> None:
-    """Run stub autopilots alone until interrupted: autopilot i at UDP 14580+i, its companion at 14540+i."""
+    """Run stub autopilots alone until interrupted: autopilot i at UDP 14580+i, its companion at 14540+i.
+
+    A vehicle's own `mavlink` URL moves both: the stub sends to that port, from 40 above it (1000 from the eleventh on).
+    """
     from companion.config import parse
-    from sim.stub_fleet import stub_settings
+    from sim.stub_fleet import check_stub_links, stub_settings
     from sim.stubs import run_stubs
 
     config = parse(_tables(fleet, vehicles), fleet.name)
+    check_stub_links(config)
     if not launched:
         for v in config.vehicles:
             typer.echo(f"vehicle {v.id}: system id {v.system_id}, speaks to {v.mavlink}", err=True)
@@ -160,6 +176,19 @@ def stub(
             grace_s=1.5 if launched else 0.0,
         )
     )  # fmt: skip
+
+
+@app.command(hidden=True)
+def sitl(
+    px4: Annotated[Path, typer.Option()], truth: Annotated[Path, typer.Option()], fleet: FleetFile = DEFAULT_FILE
+) -> None:
+    """Run PX4 SITL instances until standard input closes: for launchers."""
+    from companion.config import parse
+    from sim.sitl import SitlHost, SitlSettings, check_build
+
+    config = parse(_tables(fleet), fleet.name)
+    settings = SitlSettings(check_build(px4), truth.parent, truth, sys.stdin.fileno(), {})
+    SitlHost(config, settings).run(grace_s=1.5)
 
 
 @app.command(hidden=True)

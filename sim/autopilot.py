@@ -395,7 +395,10 @@ class Autopilot:
 
     def change_mode(self, mode: Mode) -> Result:
         """A user's mode change."""
-        return self.commander.choose(mode, self.now_ns)
+        result = self.commander.choose(mode, self.now_ns)
+        if self.commander.mode is not self._flown_mode:
+            self._enter(self.commander.mode)
+        return result
 
     def order_reboot(self) -> None:
         """Restarts after the present step, so that the answer still leaves."""

@@ -507,9 +507,7 @@ class Vehicle:
         return self.command_down_m_s2 > LANDED_THRUST_LOSS * GRAVITY_M_S2
 
     def attitude_rad(self) -> tuple[float, float, float]:
-        """Roll, pitch and yaw of the thrust that is flown; level on the ground."""
-        if self.on_ground:
-            return 0.0, 0.0, self.yaw_rad
+        """Roll, pitch and yaw of the thrust that is flown."""
         # Before the vertical thrust's loading the tilt is that of (a, g), see `move`.
         cos_yaw, sin_yaw = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
         forward = cos_yaw * self.thrust_north_m_s2 + sin_yaw * self.thrust_east_m_s2

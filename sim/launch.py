@@ -15,11 +15,11 @@ from typing import IO, Any
 
 import numpy as np
 import tomli_w
-from companion.io.recorder import read_recording
 
 from companion.config import FleetConfig, parse
 from companion.errors import CompanionError, RefusedError
 from companion.io.loop import network_settings
+from companion.io.recorder import read_recording
 from companion.io.zenoh_peers import OperatorLink
 from companion.operate import Operator
 from sim.reference_loop import read_reference_loop
@@ -31,7 +31,7 @@ READY_TIMEOUT_PER_VEHICLE_S = 3.0
 LANDING_TIMEOUT_S = 90.0
 POLL_S = 1.0
 END_TIMEOUT_S = 5.0
-STUB_GRACE_S = 1.0
+AUTOPILOTS_GRACE_S = 12.0
 LIBRARIES = ("starling-fleet", "pymavlink", "eclipse-zenoh", "numpy", "scipy", "pydantic", "mcap")
 
 
@@ -43,6 +43,10 @@ class FlightOptions:
     seed: int = 0
     duration_s: float | None = None
     """from the take-off command to landing; None: until the plan lands, or for ever"""
+    px4: Path | None = None
+    """PX4's build folder: fly SITL instances instead of stubs"""
+    external: bool = False
+    """fly autopilots that run already"""
 
 
 @dataclass(slots=True)
@@ -163,10 +167,14 @@ def _fly(
     began = time.monotonic()
     ids = [v.id for v in config.vehicles]
     processes.start("reference", "sim", "reference-loop", "--out", str(folder / "reference.bin"))
-    processes.start(
-        "stubs", "sim", "stub", "--fleet", file, "--seed", str(options.seed), "--truth", str(folder / "truth.bin"),
-        "--launched",
-    )  # fmt: skip
+    truth = folder / "truth.bin"
+    if options.px4 is not None:
+        processes.start("autopilots", "sim", "sitl", "--fleet", file, "--px4", str(options.px4), "--truth", str(truth))
+    elif not options.external:
+        processes.start(
+            "autopilots", "sim", "stub", "--fleet", file, "--seed", str(options.seed), "--truth", str(truth),
+            "--launched",
+        )  # fmt: skip
     for i in ids:
         processes.start(
             f"companion-{i}", "companion", "run", "--vehicle", str(i), "--fleet", file, "--record",
@@ -183,11 +191,11 @@ def _fly(
         lost = watch.fly(options.duration_s, interrupted)
         final = watch.said
     processes.end([f"companion-{i}" for i in ids], END_TIMEOUT_S)
-    processes.end(["stubs", "reference"], STUB_GRACE_S + END_TIMEOUT_S)
+    processes.end([n for n in ("autopilots", "reference") if n in processes.children], AUTOPILOTS_GRACE_S)
     flight = Flight(
         config=config,
         seed=options.seed,
-        truth=np.fromfile(folder / "truth.bin", TRUTH_DTYPE),
+        truth=np.fromfile(truth, TRUTH_DTYPE) if truth.exists() else np.zeros(0, TRUTH_DTYPE),
         takeoff_ns=takeoff_ns,
         lost=lost,
         versions={"python": sys.version.split()[0], **{name: version(name) for name in LIBRARIES}},
@@ -230,7 +238,7 @@ class _Watch:
         """Wait until every vehicle says that it may take off."""
         deadline = time.monotonic() + timeout_s
         while True:
-            for name in ("stubs", *(f"companion-{i}" for i in self.ids)):
+            for name in self.processes.children:
                 if self.processes.exit_status(name) is not None:
                     raise CompanionError(f"{name} ended before take-off:\n{self.processes.log_tail(name)}")
             answers = self._look("starting")

@@ -222,6 +222,7 @@ class Lockstep:
             row["custom_mode"] = t.custom_mode
             row["position_ned_m"], row["velocity_ned_m_s"] = t.position_ned_m, t.velocity_ned_m_s
             row["setpoint_gap_max_s"] = t.setpoint_gap_max_s
+            row["attitude_rate_rad_s"] = np.nan
         self._truth.append(rows)
         self._at(self.now_ns + TRUTH_INTERVAL_NS, self._sample_truth)
 

@@ -4,8 +4,9 @@ from math import cos, pi, radians, sin
 from pathlib import Path
 from random import Random
 
-from companion.config import FleetConfig, autopilot_port, companion_port
+from companion.config import FleetConfig, Vehicle, autopilot_port, companion_port, udp_endpoint
 from companion.core.frames import Ned
+from companion.errors import ConfigError
 from sim.dynamics import DynamicsParameters, GustParameters, NoiseParameters
 from sim.stubs import StubFleetSettings, StubVehicleSettings
 
@@ -18,6 +19,25 @@ FLEET_PARAMETERS: tuple[tuple[str, float | int], ...] = (
     ("COM_RCL_EXCEPT", 4),
 )
 """PX4 parameters of a fleet without RC: land when the setpoints end; OFFBOARD needs no RC"""
+
+
+def _ports(vehicle: Vehicle) -> tuple[int, int]:
+    """The stub's UDP port and its companion's: the one in the vehicle's URL, and PX4's distance from it."""
+    endpoint = udp_endpoint(vehicle.mavlink)
+    companion = companion_port(vehicle.instance) if endpoint is None else endpoint[1]
+    return autopilot_port(vehicle.instance, companion), companion
+
+
+def check_stub_links(config: FleetConfig) -> None:
+    """Raise ConfigError if a vehicle's link cannot be a stub's; lockstep, which has no sockets, does not mind."""
+    for v in config.vehicles:
+        where = f"vehicle {v.id}: mavlink = {v.mavlink!r}"
+        endpoint = udp_endpoint(v.mavlink)
+        if endpoint is None or endpoint[0] not in ("0.0.0.0", "127.0.0.1", "localhost"):
+            raise ConfigError(f"{where}: a stub speaks to udp://127.0.0.1:PORT only")
+        own, _ = _ports(v)
+        if own > 65535:
+            raise ConfigError(f"{where}: the stub's own port would be {own}; the companion's must be lower")
 
 
 def stub_settings(
@@ -35,12 +55,13 @@ def stub_settings(
     for k, v in enumerate(config.vehicles):
         way, angle = stub.origin_scatter_m * random.random(), 2.0 * pi * random.random()
         offset = Ned(way * cos(angle), way * sin(angle), 0.2 * stub.origin_scatter_m * (random.random() - 0.5))
+        own, companion = _ports(v)
         vehicles.append(
             StubVehicleSettings(
                 vehicle_id=v.id,
                 system_id=v.system_id,
-                autopilot_port=autopilot_port(v.instance),
-                companion_port=companion_port(v.instance),
+                autopilot_port=own,
+                companion_port=companion,
                 home_ned_m=Ned(v.pad_north_m, v.pad_east_m, 0.0),
                 ekf_origin_offset_m=offset if config.fleet.frame == "global" else Ned(
                     -v.pad_north_m, -v.pad_east_m, 0.0

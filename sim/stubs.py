@@ -33,6 +33,7 @@ TRUTH_DTYPE = np.dtype(
         ("position_ned_m", "<f8", (3,)),
         ("velocity_ned_m_s", "<f4", (3,)),
         ("setpoint_gap_max_s", "<f4"),
+        ("attitude_rate_rad_s", "<f4"),
     ]
 )
 """one record of the truth file: UTC, the vehicle, MAV_LANDED_STATE, PX4's custom_mode, true motion in the fleet frame,
@@ -105,6 +106,7 @@ class _TruthRecorder:
             row["position_ned_m"] = state.position_ned_m
             row["velocity_ned_m_s"] = state.velocity_ned_m_s
             row["setpoint_gap_max_s"] = state.setpoint_gap_max_s
+            row["attitude_rate_rad_s"] = np.nan
         self._file.write(rows.tobytes())
         if now_ns - self._flushed_ns >= FLUSH_INTERVAL_NS:
             self._flushed_ns = now_ns

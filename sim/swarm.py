@@ -124,6 +124,8 @@ class Setup:
     """agents start anywhere in a ball of this radius about their slots"""
     start_velocity_m_s: float = 0.1
     """and with the plan's velocity plus up to this much on each axis"""
+    start_separation_m: float = 0.0
+    """starts are drawn again until no two are closer than this (up to 200 agents)"""
     scrambled: bool = False
     """agents start at each other's slots, so that their paths cross"""
 
@@ -280,7 +282,8 @@ def _filled(base: Any, values: Mapping[str, Any], where: str) -> Any:
         if get_origin(kind) is Literal and value not in get_args(kind):
             raise ConfigError(f"{where}.{name} must be one of {', '.join(get_args(kind))}, got {value!r}")
         if (kind is bool) != isinstance(value, bool) or (
-            (kind in (int, float) and not isinstance(value, int | float)) or (kind is int and not isinstance(value, int))
+            (kind in (int, float) and not isinstance(value, int | float))
+            or (kind is int and not isinstance(value, int))
         ):
             raise ConfigError(f"{where}.{name} must be {getattr(kind, '__name__', kind)}, got {value!r}")
     converted = {
@@ -387,8 +390,14 @@ def starts(setup: Setup, seed: int) -> tuple[Floats, Floats]:
         x = x[order]
     for i in range(n):
         rng = np.random.default_rng([seed, i])
-        direction = rng.normal(size=3)
-        x[i] += setup.start_ball_m * rng.random() ** (1 / 3) * direction / np.linalg.norm(direction)
+        for _ in range(1000):
+            direction = rng.normal(size=3)
+            place = x[i] + setup.start_ball_m * rng.random() ** (1 / 3) * direction / np.linalg.norm(direction)
+            if setup.start_separation_m <= 0.0 or i == 0:
+                break
+            if np.linalg.norm(x[:i] - place, axis=1).min() >= setup.start_separation_m:
+                break
+        x[i] = place
         v[i] += setup.start_velocity_m_s * rng.uniform(-1, 1, size=3)
     return x, v
 

@@ -181,7 +181,7 @@ class PeerTable:
 
     def silent_for_s(self, now: Instant) -> float | None:
         """How long nobody has been heard or present; None if nobody ever was (s)."""
-        if any(p.present for p in self._peers.values()):
+        if any(p.present and p.lost_at_ns is None for p in self._peers.values()):
             return 0.0
         ends = [p.lost_at_ns for p in self._peers.values() if p.lost_at_ns is not None]
         return (now.fleet_ns - max(ends)) * 1e-9 if ends else None

@@ -9,7 +9,7 @@ the largest wins, which is how vehicles without a leader agree on one of several
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from math import atan2, cos, dist, hypot, inf, pi, sin, sqrt
+from math import atan2, copysign, cos, dist, hypot, inf, pi, sin, sqrt
 from typing import Literal, NamedTuple
 
 from companion.core.formation import Slots, assign
@@ -20,6 +20,8 @@ PLAN_ACCELERATION_M_S2 = 0.5
 """the largest acceleration with which a leg changes the centre's velocity"""
 TURN_RAMP_S = 3.0
 """time in which a turn's rate is built up and taken back"""
+SPEED_SAMPLES = 16
+"""moments of a leg without a steady course at which its speed is looked at"""
 BLEND_MIN_S = 8.0
 """shortest time in which slots move from one formation to the next"""
 
@@ -57,7 +59,10 @@ class VelocityLeg:
 
 @dataclass(frozen=True, slots=True)
 class TurnLeg:
-    """Turn the horizontal velocity at `rate_rad_s` (positive clockwise) through `angle_rad`, its speed unchanged."""
+    """Turn the horizontal velocity at `rate_rad_s` (positive clockwise) through `angle_rad`, its speed unchanged.
+
+    An angle too small to reach the rate within TURN_RAMP_S is turned at a lower one.
+    """
 
     rate_rad_s: float
     angle_rad: float
@@ -119,8 +124,8 @@ def _ramp_s(dv: Ned) -> float:
 
 def _turn_profile(leg: TurnLeg, t: float) -> tuple[float, float, float]:
     """Angle turned (rad), its rate and its acceleration at t; the rate rises and falls as a smoothstep."""
-    rate = leg.rate_rad_s
-    ramp, whole = _turn_times(leg)
+    rate, whole = _turn_rate_and_time(leg)
+    ramp = TURN_RAMP_S
 
     def rising(s: float) -> tuple[float, float, float]:
         x = min(s / ramp, 1.0)
@@ -135,11 +140,10 @@ def _turn_profile(leg: TurnLeg, t: float) -> tuple[float, float, float]:
     return total - angle, now, -change
 
 
-def _turn_times(leg: TurnLeg) -> tuple[float, float]:
-    """Ramp and whole duration (s): the rate's area under ramps and plateau is the angle."""
-    rate = abs(leg.rate_rad_s)
-    ramp = min(TURN_RAMP_S, leg.angle_rad / rate)
-    return ramp, leg.angle_rad / rate + ramp
+def _turn_rate_and_time(leg: TurnLeg) -> tuple[float, float]:
+    """Signed rate (rad/s) and whole duration (s): the rate's area under two ramps and the plateau is the angle."""
+    rate = min(abs(leg.rate_rad_s), leg.angle_rad / TURN_RAMP_S)
+    return copysign(rate, leg.rate_rad_s), leg.angle_rad / rate + TURN_RAMP_S
 
 
 @lru_cache(maxsize=16)
@@ -156,14 +160,15 @@ def _arc(leg: TurnLeg, v0: Ned, start: float, end: float) -> tuple[float, float]
 
 
 def _turn_leg(leg: TurnLeg, p0: Ned, v0: Ned, t: float) -> _Centre:
-    ramp, whole = _turn_times(leg)
+    plateau, whole = _turn_rate_and_time(leg)
+    ramp = TURN_RAMP_S
     angle, rate, change = _turn_profile(leg, t)
     north, east = _arc(leg, v0, 0.0, min(t, ramp))
     if t > ramp:
         # Constant rate in closed form, up to the falling ramp.
         until = min(t, whole - ramp)
         a0, a1 = _turn_profile(leg, ramp)[0], _turn_profile(leg, until)[0]
-        s, c = (sin(a1) - sin(a0)) / leg.rate_rad_s, (cos(a1) - cos(a0)) / leg.rate_rad_s
+        s, c = (sin(a1) - sin(a0)) / plateau, (cos(a1) - cos(a0)) / plateau
         north += s * v0.north + c * v0.east
         east += s * v0.east - c * v0.north
         if t > until:
@@ -212,7 +217,7 @@ def leg_duration_s(leg: Leg, v0: Ned) -> float:
         case VelocityLeg():
             return max(leg.duration_s, _ramp_s(Ned(*(b - a for a, b in zip(v0, leg.velocity_ned_m_s, strict=True)))))
         case TurnLeg():
-            return _turn_times(leg)[1]
+            return _turn_rate_and_time(leg)[1]
         case GotoLeg():
             return leg.duration_s
 
@@ -448,6 +453,22 @@ def assignment_matches(motion: Motion, slots: Slots, pinned: Mapping[int, int]) 
 
 def _rows(ids: Sequence[int], pinned: Mapping[int, int]) -> dict[int, int]:
     return {row: pinned[i] for row, i in enumerate(ids) if i in pinned}
+
+
+def top_speed_m_s(motion: Motion) -> float:
+    """The centre's greatest level speed over the motion (m/s), looked for at the legs' ends and inside them."""
+    v = motion.velocity_ned_m_s
+    fastest = hypot(v.north, v.east)
+    since = 0.0
+    for leg in motion.legs:
+        duration = leg_duration_s(leg, v)
+        parts = SPEED_SAMPLES if isinstance(leg, GotoLeg) else 1
+        # The velocity of an endless turn changes its direction only.
+        for k in range(1, parts + 1 if duration < inf else 1):
+            v = motion.moment(motion.legs_start_ns + round((since + duration * k / parts) * 1e9)).centre.velocity
+            fastest = max(fastest, hypot(v.north, v.east))
+        since += duration
+    return fastest
 
 
 def course_rad(velocity_ned_m_s: Ned) -> float | None:

@@ -37,5 +37,9 @@ class FleetClock:
 
 
 def realtime_to_monotonic(realtime_ns: int) -> int:
-    """A kernel time stamp (CLOCK_REALTIME, as SO_TIMESTAMPNS gives it) on the monotonic clock."""
-    return realtime_ns - (time.time_ns() - time.monotonic_ns())
+    """A kernel time stamp (CLOCK_REALTIME, as SO_TIMESTAMPNS gives it) on the monotonic clock; never later than now.
+
+    Wall time set back between stamp and reading would else put the stamp into the future.
+    """
+    now_ns = time.monotonic_ns()
+    return min(realtime_ns - (time.time_ns() - now_ns), now_ns)

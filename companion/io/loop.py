@@ -31,9 +31,10 @@ from companion.io.recorder import Recorder
 from companion.io.traffic import tcp_bytes_sent
 from companion.io.zenoh_peers import PeerMessage, PeerNetwork, PeerNetworkSettings, PresenceChange, Request
 
-TICK_RECORD = struct.Struct("<qqqff?")
-"""body of the "tick" channel: lateness ns, sensor-to-setpoint latency ns (-1 for a timer's tick), process CPU ns,
-position error m, nearest neighbour m, whether a setpoint was sent"""
+TICK_RECORD = struct.Struct("<qqqff?6f")
+"""body of the "tick" channel: lateness ns, sensor-to-setpoint latency ns (-1 for a timer's tick), CPU ns of the loop so
+far, position error m, nearest neighbour m, whether a setpoint was sent, own position (m) and velocity (m/s) as believed
+(fleet frame, NED)"""
 TRAFFIC_RECORD = struct.Struct("<q")
 """body of the "traffic" channel: bytes that this process's TCP connections have sent so far"""
 LANDING_GRACE_S = 3.0
@@ -99,12 +100,18 @@ class Companion:
             endpoint = udp_endpoint(self.agent.vehicle.mavlink)
             if endpoint is None:
                 raise CompanionError(f"link {self.agent.vehicle.mavlink!r} is not supported yet; use udp://HOST:PORT")
-            self.link = UdpLink(*endpoint)
+            try:
+                self.link = UdpLink(*endpoint)
+            except CompanionError as error:
+                raise CompanionError(f"vehicle {settings.vehicle_id}: {error}") from error
             self._resources.callback(self.link.close)
             self.recorder: Recorder | None = None
             if settings.record is not None:
                 facts = {**metadata, "vehicle_id": str(settings.vehicle_id), "boot_id": str(self.boot_id)}
-                self.recorder = Recorder(settings.record, facts)
+                try:
+                    self.recorder = Recorder(settings.record, facts)
+                except OSError as error:
+                    raise CompanionError(f"--record {settings.record}: cannot be written: {error.strerror}") from error
                 self._resources.callback(self.recorder.close)
             self.network = PeerNetwork(network_settings(config, settings.vehicle_id), self._wake)
             self._resources.callback(self.network.close)
@@ -128,14 +135,14 @@ class Companion:
         self._resources.close()
 
     def stop(self, grace_s: float = LANDING_GRACE_S) -> None:
-        """Land, and end once the autopilot has taken over or the grace is over."""
+        """Land, and end once the autopilot has taken over or the grace is over; a second call may shorten the grace."""
+        now = self._instant(time.monotonic_ns())
+        stop_by_ns = now.monotonic_ns + round(grace_s * 1e9)
         if self._stop_by_ns is None:
-            now = self._instant(time.monotonic_ns())
             self._record("input/stop", now, b"")
             self.agent.stop(now)
-            self._stop_by_ns = now.monotonic_ns + round(grace_s * 1e9)
-        else:
-            self._stop_by_ns = 0
+            self._stop_by_ns = stop_by_ns
+        self._stop_by_ns = min(self._stop_by_ns, stop_by_ns)
 
     def run(self) -> int:
         """Run until stopped; 0 if the vehicle was safe then, 3 if it still flew without a confirmed landing."""
@@ -158,9 +165,10 @@ class Companion:
                 requests = self._receive(ready)
                 if asked:
                     asked.pop()
-                    self.stop()
-                if self.settings.stop_fd in ready and not os.read(self.settings.stop_fd, 4096):
-                    waiting.remove(self.settings.stop_fd)
+                    self.stop(LANDING_GRACE_S if self._stop_by_ns is None else 0.0)
+                stop_fd = self.settings.stop_fd
+                if stop_fd is not None and stop_fd in ready and not os.read(stop_fd, 4096):
+                    waiting.remove(stop_fd)
                     self.stop(ABANDONED_GRACE_S)
                 self._advance(deadline_ns)
                 for request in requests:
@@ -182,10 +190,13 @@ class Companion:
 
     def _receive(self, ready: list[Any]) -> list[Request]:
         if self.link in ready:
-            for datagram, received_ns in self.link.receive():
+            for datagram, received_ns, address in self.link.receive():
+                if not self.link.admits(address, received_ns):
+                    continue
                 now = self._instant(received_ns)
                 self._record("input/mavlink", now, datagram)
-                self.agent.receive_mavlink(datagram, now)
+                if self.agent.receive_mavlink(datagram, now):
+                    self.link.confirm(address, received_ns)
                 if self._driver_ns is None and self.agent.next_deadline_ns() == 0:
                     self._driver_ns = received_ns
         if self._wake_read in ready:
@@ -224,15 +235,16 @@ class Companion:
             self._record("output/peer", now, topic.encode() + b"\0" + payload)
         for note in out.notes:
             self._record("note", now, note.encode())
-            self.settings.log(note)
+            with suppress(OSError):  # a full disk must not end a flight; the recording counts its own losses
+                self.settings.log(note)
         driver_ns, self._driver_ns = self._driver_ns, None
         if out.tick is not None:
             latency_ns = -1 if driver_ns is None else sent_ns - driver_ns
             self.lateness_ns = sent_ns - deadline_ns if driver_ns is None else latency_ns
             tick = out.tick
             self._record("tick", now, TICK_RECORD.pack(
-                self.lateness_ns, latency_ns, time.process_time_ns(), tick.position_error_m, tick.nearest_m,
-                bool(out.mavlink),
+                self.lateness_ns, latency_ns, time.thread_time_ns(), tick.position_error_m, tick.nearest_m,
+                tick.steered, *tick.position_ned_m, *tick.velocity_ned_m_s,
             ))  # fmt: skip
 
     def _reply(self, request: Request) -> None:
@@ -246,7 +258,12 @@ class Companion:
         status["lateness_ms"] = self.lateness_ns * 1e-6
         status["dropped"] = counters.dropped
         status["recorder_lost"] = 0 if self.recorder is None else self.recorder.lost
-        status["rejected"]["peer: malformed key"] = counters.malformed
+        elsewhere = {
+            "mavlink: another address than the autopilot's": self.link.strangers,
+            "peer: malformed": counters.malformed,
+            "peer: under our own id": counters.own_id_heard,
+        }
+        status["rejected"] |= {kind: count for kind, count in elsewhere.items() if count}
         request.reply(json.dumps(status).encode())
 
     def _each_second(self, now_ns: int) -> None:

@@ -17,9 +17,13 @@ from pymavlink.dialects.v20 import development as mavlink
 
 from companion.core.frames import Geodetic, Ned
 
+dialect = mavlink
+"""pymavlink's generated messages: `development`, since `common` lacks CURRENT_MODE"""
 COMPANION_COMPONENT_ID = 191
 AUTOPILOT_COMPONENT_ID = 1
 AUTOPILOT_PX4 = 12
+PLAUSIBLE_MAX = 1e6
+"""no position (m) or velocity (m/s) is larger than this: float32 holds far more, and squares of it overflow later"""
 SETPOINT_TYPE_MASK = 0x903
 """ignore x, y, az and yaw rate: velocity and acceleration on the level, altitude by position, climb rate, yaw"""
 
@@ -155,7 +159,7 @@ class MavlinkLink:
         if len(datagram) >= 10 and datagram[0] == 0xFD:
             # Most of a link's traffic is not for us; the header tells at a hundredth of a decoding's cost.
             message_id = datagram[7] | datagram[8] << 8 | datagram[9] << 16
-            whole = len(datagram) == 12 + datagram[1] + (13 if datagram[2] & 1 else 0)
+            whole = datagram[2] < 2 and len(datagram) == 12 + datagram[1] + 13 * datagram[2]
             if whole and message_id not in _READ:
                 self.not_read += 1
                 return []
@@ -168,8 +172,9 @@ class MavlinkLink:
                 return [] if event is None else [event]
         errors = self._in.total_receive_errors
         messages = self._in.parse_buffer(datagram) or []
-        if self._in.total_receive_errors > errors or not messages:
+        if self._in.total_receive_errors > errors or not messages or self._in.buf_len() > 0:
             self.rejected["malformed"] += 1
+            # What is cut off at a datagram's end does not go on in the next.
             self._in.buf.clear()
             self._in.buf_index = 0
         events = []
@@ -188,8 +193,8 @@ class MavlinkLink:
         match message:
             case mavlink.MAVLink_local_position_ned_message():
                 numbers = (message.x, message.y, message.z, message.vx, message.vy, message.vz)
-                if not all(isfinite(x) for x in numbers):
-                    self.rejected["not finite"] += 1
+                if not all(abs(x) <= PLAUSIBLE_MAX for x in numbers):
+                    self.rejected["not finite" if not all(map(isfinite, numbers)) else "out of range"] += 1
                     return None
                 return LocalPosition(message.time_boot_ms, Ned(*numbers[:3]), Ned(*numbers[3:]))
             case mavlink.MAVLink_heartbeat_message():
@@ -202,6 +207,9 @@ class MavlinkLink:
             case mavlink.MAVLink_extended_sys_state_message():
                 return LandedState(message.landed_state)
             case mavlink.MAVLink_gps_global_origin_message():
+                if abs(message.latitude) > 900_000_000 or abs(message.longitude) > 1_800_000_000:
+                    self.rejected["out of range"] += 1
+                    return None
                 return GlobalOrigin(
                     Geodetic(message.latitude * 1e-7, message.longitude * 1e-7, message.altitude * 1e-3)
                 )

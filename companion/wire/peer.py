@@ -21,6 +21,8 @@ from companion.core.values import PeerMessage, PeerSample, Phase
 from companion.errors import WireError
 
 VERSION = 1
+PLAUSIBLE_MAX = 1e6
+"""no position (m) or velocity (m/s) is larger than this: float32 holds far more, and squares of it overflow later"""
 _HEADER = struct.Struct("<BBBBIIIqB")
 _SAMPLE = struct.Struct("<q6f")
 _ENTRY = struct.Struct("<BBI")
@@ -65,8 +67,8 @@ def decode_state(payload: bytes) -> PeerMessage:
 
 def _sample(payload: bytes, at: int, vehicle_id: int, phase: int, revision: int) -> PeerSample:
     time_ns, *numbers = _SAMPLE.unpack_from(payload, at)
-    if not all(isfinite(x) for x in numbers):
-        raise WireError("not finite")
+    if not all(abs(x) <= PLAUSIBLE_MAX for x in numbers):
+        raise WireError("not finite" if not all(map(isfinite, numbers)) else "out of range")
     try:
         known = Phase(phase)
     except ValueError:
@@ -74,8 +76,13 @@ def _sample(payload: bytes, at: int, vehicle_id: int, phase: int, revision: int)
     return PeerSample(vehicle_id, time_ns, Ned(*numbers[:3]), Ned(*numbers[3:]), revision, known)
 
 
-_Number = Annotated[float, Field(allow_inf_nan=False)]
-_Vector = tuple[_Number, _Number, _Number]
+# Ranges that any plan keeps by far, and within which its arithmetic cannot overflow.
+_Metres = Annotated[float, Field(ge=-PLAUSIBLE_MAX, le=PLAUSIBLE_MAX, allow_inf_nan=False)]
+_MetresPerSecond = Annotated[float, Field(ge=-100, le=100, allow_inf_nan=False)]
+_Place = tuple[_Metres, _Metres, _Metres]
+_Velocity = tuple[_MetresPerSecond, _MetresPerSecond, _MetresPerSecond]
+_Angle = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
+TURN_RATE_MIN_RAD_S = 1e-4
 
 
 class _Model(BaseModel):
@@ -84,21 +91,21 @@ class _Model(BaseModel):
 
 class _VelocityLeg(_Model):
     kind: Literal["velocity"]
-    velocity_ned_m_s: _Vector
-    duration_s: Annotated[float, Field(ge=0, allow_inf_nan=False)]
+    velocity_ned_m_s: _Velocity
+    duration_s: Annotated[float, Field(ge=0, le=1e7, allow_inf_nan=False)]
 
 
 class _TurnLeg(_Model):
     kind: Literal["turn"]
     rate_rad_s: Annotated[float, Field(ge=-1.1, le=1.1, allow_inf_nan=False)]
-    angle_rad: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None
+    angle_rad: Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)] | None
     """None circles for ever (JSON knows no infinity)"""
 
 
 class _GotoLeg(_Model):
     kind: Literal["goto"]
-    target_ned_m: _Vector
-    duration_s: Annotated[float, Field(gt=0, allow_inf_nan=False)]
+    target_ned_m: _Place
+    duration_s: Annotated[float, Field(ge=0.1, le=1e7, allow_inf_nan=False)]
 
 
 class _Motion(_Model):
@@ -107,14 +114,14 @@ class _Motion(_Model):
     start_ns: Annotated[int, Field(ge=0, lt=1 << 63)]
     issuer: Annotated[int, Field(ge=0, le=255)]
     shape: Annotated[str, Field(max_length=32)]
-    slots: dict[int, tuple[_Vector, _Vector]]
+    slots: dict[int, tuple[_Place, _Place]]
     blend_start_ns: Annotated[int, Field(ge=0, lt=1 << 63)]
     blend_s: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)]
     legs_start_ns: Annotated[int, Field(ge=0, lt=1 << 63)]
-    centre_ned_m: _Vector
-    velocity_ned_m_s: _Vector
-    heading_rad: _Number
-    heading_rate_rad_s: _Number
+    centre_ned_m: _Place
+    velocity_ned_m_s: _Velocity
+    heading_rad: _Angle
+    heading_rate_rad_s: Annotated[float, Field(ge=-10, le=10, allow_inf_nan=False)]
     heading_follows_turns: bool
     legs: Annotated[
         tuple[Annotated[_VelocityLeg | _TurnLeg | _GotoLeg, Field(discriminator="kind")], ...], Field(max_length=100)
@@ -151,7 +158,7 @@ def decode_motion(payload: bytes) -> Motion:
             case _VelocityLeg():
                 legs.append(VelocityLeg(Ned(*leg.velocity_ned_m_s), leg.duration_s))
             case _TurnLeg():
-                if leg.rate_rad_s == 0.0:
+                if not abs(leg.rate_rad_s) >= TURN_RATE_MIN_RAD_S:
                     raise WireError("motion: a turn without a rate")
                 legs.append(TurnLeg(leg.rate_rad_s, float("inf") if leg.angle_rad is None else leg.angle_rad))
             case _GotoLeg():

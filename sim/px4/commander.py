@@ -189,7 +189,7 @@ class Commander:
             self._killed_at_ns = now_ns
 
     def move_sticks(self, now_ns: int) -> None:
-        """A pilot moves the sticks: a takeover of automatic modes (bit 0 of COM_RC_OVERRIDE) and of offboard (bit 1)."""
+        """A pilot moves the sticks: takes over automatic modes (COM_RC_OVERRIDE bit 0) and offboard (bit 1)."""
         self.pilot_present = True
         override = self._parameters.integer("COM_RC_OVERRIDE")
         if (self.mode.is_auto and override & 1) or (self.mode is Mode.OFFBOARD and override & 2):

@@ -3,7 +3,7 @@
 import math
 import random
 
-from sim.dynamics import NoiseParameters, OrnsteinUhlenbeck, Vehicle
+from sim.dynamics import GRAVITY_M_S2, NoiseParameters, OrnsteinUhlenbeck, Vehicle
 from sim.px4.telemetry import Telemetry
 
 NO_AID_TIMEOUT_NS = 5_000_000_000
@@ -128,6 +128,11 @@ class Estimator:
         telemetry.velocity_north_m_s = north
         telemetry.velocity_east_m_s = east
         telemetry.velocity_down_m_s = down
+        telemetry.specific_force_ned_m_s2 = (
+            vehicle.acceleration_north_m_s2,
+            vehicle.acceleration_east_m_s2,
+            vehicle.acceleration_down_m_s2 - GRAVITY_M_S2,
+        )
         roll, pitch, yaw = vehicle.attitude_rad()
         per_s = 1.0 / self._step_s
         telemetry.roll_rate_rad_s = (roll - telemetry.roll_rad) * per_s

@@ -42,8 +42,8 @@ MODE_OF_CUSTOM = {mode.custom_mode: mode for mode in Mode}
 MAIN_MODES = frozenset(mode.value[0] for mode in Mode)
 
 NOT_ARMABLE_MODES = frozenset({Mode.LAND, Mode.RTL, Mode.TERMINATION})
-"""modes that prevent arming (PX4's mode_req_prevent_arming); when disarmed PX4 falls back to the last choice that is none
-of these"""
+"""modes that prevent arming (PX4's mode_req_prevent_arming); when disarmed PX4 falls back to the last choice that is
+none of these"""
 
 STANDARD_MODE = {Mode.LAND: 7, Mode.TAKEOFF: 8}
 """CURRENT_MODE.standard_mode as recorded (MAV_STANDARD_MODE_LAND, _TAKEOFF); 0 for the others"""

@@ -29,6 +29,7 @@ class Navigator:
         self._velocity_north = self._velocity_east = self._velocity_down = 0.0
         self._target: tuple[float, float] | None = None
         self._target_down = NAN
+        self._takeoff_down = self._takeoff_yaw = NAN
         self._yaw = NAN
         self._home = (0.0, 0.0, 0.0)
         self._returning_above = False
@@ -56,15 +57,18 @@ class Navigator:
             self._velocity_north = self._velocity_east = 0.0
             self._lifted = False
             self.takeoff_done = False
+            self._target_down = self._takeoff_down
+            self._yaw = self._takeoff_yaw
+            self._takeoff_down = self._takeoff_yaw = NAN
             if math.isnan(self._target_down):
                 self._target_down = down - self._parameters.number("MIS_TAKEOFF_ALT")
         elif not keep_altitude:
             self._target_down = NAN
 
     def take_off_to(self, down_m: float, yaw_rad: float) -> None:
-        """Altitude (and heading, NaN: as it is) of the next take-off."""
-        self._target_down = down_m
-        self._yaw = yaw_rad
+        """Down (NaN: MIS_TAKEOFF_ALT above here) and heading (NaN: as it is) of the next take-off."""
+        self._takeoff_down = down_m
+        self._takeoff_yaw = yaw_rad
 
     def go_to(self, north_m: float, east_m: float, down_m: float, yaw_rad: float) -> None:
         """Repositions the hold; NaN keeps what is."""

@@ -12,7 +12,7 @@ os.environ["MAVLINK20"] = "1"
 # CURRENT_MODE (436) is not in the `common` dialect of pymavlink 2.4; `development` includes all of `common`.
 from pymavlink.dialects.v20 import development as mavlink
 
-from sim.dynamics import GRAVITY_M_S2, NAN
+from sim.dynamics import NAN
 from sim.px4.modes import STANDARD_MODE, Mode, base_mode
 from sim.px4.telemetry import Telemetry, quaternion, to_body
 
@@ -131,10 +131,7 @@ def _odometry(s: Telemetry) -> Any:
 
 
 def _highres_imu(s: Telemetry) -> Any:
-    v = s.vehicle
-    # Specific force: acceleration minus gravity, turned into the body's axes.
-    force = (v.acceleration_north_m_s2, v.acceleration_east_m_s2, v.acceleration_down_m_s2 - GRAVITY_M_S2)
-    x, y, z = to_body(force, s.roll_rad, s.pitch_rad, s.yaw_rad)
+    x, y, z = to_body(s.specific_force_ned_m_s2, s.roll_rad, s.pitch_rad, s.yaw_rad)
     mx, my, mz = to_body((0.21, 0.01, 0.43), s.roll_rad, s.pitch_rad, s.yaw_rad)
     altitude = s.altitude_amsl_m
     return mavlink.MAVLink_highres_imu_message(
@@ -499,7 +496,7 @@ STREAMS: dict[int, tuple[float, Builder]] = {
     mavlink.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW: (10.0, _servo_output_raw),
     mavlink.MAVLINK_MSG_ID_VFR_HUD: (10.0, _vfr_hud),
     mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: (8.0, _gps_raw_int),
-    mavlink.MAVLINK_MSG_ID_POSITION_TARGET_GLOBAL_INT: (5.0, _position_target_global_int),
+    mavlink.MAVLINK_MSG_ID_POSITION_TARGET_GLOBAL_INT: (10.0, _position_target_global_int),
     mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: (5.0, _extended_sys_state),
     mavlink.MAVLINK_MSG_ID_SYS_STATUS: (5.0, _sys_status),
     mavlink.MAVLINK_MSG_ID_HEARTBEAT: (1.0, _heartbeat),

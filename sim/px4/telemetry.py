@@ -73,6 +73,8 @@ class Telemetry:
         """time of the estimate, ns since boot"""
         self.north_m = self.east_m = self.down_m = 0.0
         self.velocity_north_m_s = self.velocity_east_m_s = self.velocity_down_m_s = 0.0
+        self.specific_force_ned_m_s2 = (0.0, 0.0, -GRAVITY_M_S2)
+        """acceleration less gravity: what an accelerometer feels"""
         self.roll_rad = self.pitch_rad = self.yaw_rad = 0.0
         self.roll_rate_rad_s = self.pitch_rate_rad_s = self.yaw_rate_rad_s = 0.0
         self.setpoint: Setpoint | None = None

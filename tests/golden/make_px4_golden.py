@@ -3,8 +3,8 @@
     python tests/golden/make_px4_golden.py RECORDINGS
 
 RECORDINGS holds `capture.jsonl.xz` (one offboard link: idle, arm, take-off to 5 m, offboard, land, disarm; one JSON
-object a line with t, type, fields) and `steps.json.xz` (step responses of two vehicles; rows of t, x, y, z, vx, vy, vz by the
-estimate and in truth). Written: px4_streams.json and px4_steps.json beside this file.
+object a line with t, type, fields) and `steps.json.xz` (step responses of two vehicles; rows of t, x, y, z, vx, vy, vz
+by the estimate and in truth). Written: px4_streams.json and px4_steps.json beside this file.
 """
 
 import json

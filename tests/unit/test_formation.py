@@ -1,7 +1,7 @@
 """Shapes for every size, and assignments that every vehicle finds alike."""
 
 import random
-from itertools import permutations, product
+from itertools import pairwise, permutations, product
 from math import dist, inf, pi, sqrt
 
 import numpy as np
@@ -84,7 +84,7 @@ def test_spiral_turns_outward_with_its_spacing_along_it() -> None:
     slots = SHAPES["spiral"](40, 2.0)
     radii = [dist(s, (0.0, 0.0, 0.0)) for s in slots]
     assert radii == sorted(radii)
-    assert [dist(a, b) for a, b in zip(slots, slots[1:], strict=False)] == pytest.approx([2.0] * 39, abs=1e-9)
+    assert [dist(a, b) for a, b in pairwise(slots)] == pytest.approx([2.0] * 39, abs=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -173,7 +173,7 @@ def test_the_last_bits_of_coordinates_decide_nothing(count: int) -> None:
         return [Ned(*(x * (1 + rng.uniform(-1, 1) * 4e-16) for x in s)) for s in slots]
 
     names = ["v", "circle", "line", "grid", "v"]
-    for before, after in zip(names, names[1:], strict=False):
+    for before, after in pairwise(names):
         a, b = shape_slots(before, count, 4.0), shape_slots(after, count, 4.0)
         assert {assign(shaken(a), shaken(b)) for _ in range(5)} == {assign(a, b)}
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from functools import reduce
+from itertools import pairwise
 from math import inf, pi, sqrt
 
 import numpy as np
@@ -217,7 +218,7 @@ def test_separation_of_known_distances(distance_m: float, expected: float) -> No
 
 def test_separation_ends_continuously_at_its_range() -> None:
     steps = [separation(2.0 - k * 1e-4, 0.0, 0.0, FLIGHT)[0] for k in range(-20, 20)]
-    assert max(abs(b - a) for a, b in zip(steps, steps[1:], strict=False)) < 1e-3
+    assert max(abs(b - a) for a, b in pairwise(steps)) < 1e-3
     assert separation(2.0 - 1e-9, 0.0, 0.0, FLIGHT)[0] < 1e-8
 
 
@@ -245,7 +246,8 @@ def test_a_single_vehicle_tracks_the_plan_alone(e: Vector, w: Vector, a: Vector)
 def test_a_formation_in_place_and_at_speed_is_left_alone() -> None:
     slots = np.array([[0.0, 0, 0], [-3.0, 3, 0], [-3.0, -3, 0]])
     v_d, a_d = np.array([1.0, 0.5, 0.0]), np.array([0.1, -0.2, 0.0])
-    scene = Scene(slots + [7.0, 8.0, -9.0], np.tile(v_d, (3, 1)), slots + [7.0, 8.0, -9.0], v_d, a_d)
+    there = slots + np.array([7.0, 8.0, -9.0])
+    scene = Scene(there, np.tile(v_d, (3, 1)), there, v_d, a_d)
     assert command(scene, FLIGHT) == pytest.approx(a_d)
 
 

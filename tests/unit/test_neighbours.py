@@ -65,7 +65,7 @@ def sample(t: PeerTable, vehicle: int, seconds: float, phase: Phase = Phase.FORM
     """Of a vehicle in its slot."""
     r = t.programme.reference(vehicle, ns(seconds))
     made = PeerSample(vehicle, ns(seconds), r.position_ned_m, r.velocity_ned_m_s, 1, phase)
-    return replace(made, **changed)  # type: ignore[arg-type]
+    return made._replace(**changed)
 
 
 def message(s: PeerSample, sequence: int = 1, boot_id: int = 7, digest: tuple[PeerSample, ...] = ()) -> PeerMessage:
@@ -323,8 +323,7 @@ def with_one_off(t: PeerTable, shift: Ned, drift: Ned) -> PeerTable:
     for vehicle in (2, 3, 4, 5):
         s = sample(t, vehicle, 10.0)
         if vehicle == 3:
-            s = replace(
-                s, position_ned_m=Ned(*map(sum, zip(s.position_ned_m, shift, strict=True))),
+            s = s._replace(position_ned_m=Ned(*map(sum, zip(s.position_ned_m, shift, strict=True))),
                 velocity_ned_m_s=Ned(*map(sum, zip(s.velocity_ned_m_s, drift, strict=True))),
             )  # fmt: skip
         t.accept(message(s), at(10.0))
@@ -371,7 +370,7 @@ def test_gating_with_nobody_or_one_peer_gates_nobody() -> None:
     assert predicted(table(), 1.0, gated=True) == {}
     t = table()
     s = sample(t, 2, 1.0)
-    t.accept(message(replace(s, position_ned_m=Ned(50.0, 0.0, 0.0))), at(1.0))
+    t.accept(message(s._replace(position_ned_m=Ned(50.0, 0.0, 0.0))), at(1.0))
     assert predicted(t, 1.0, gated=True)[2].in_formation
 
 

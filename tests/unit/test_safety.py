@@ -233,10 +233,26 @@ def test_vertical_distance_counts_less_by_the_downwash() -> None:
 def test_the_nearest_place_of_a_lost_peer_is_the_nearest_of_its_segment(ego: Ned, a: Ned, b: Ned, v: Ned) -> None:
     place, velocity = nearest_hypothesis(ego, peer(a, v, other_end_ned_m=b))
     shares = np.linspace(0.0, 1.0, 401)
+    scale = np.array([1.0, 1.0, 1.0 / DOWNWASH_RATIO])  # the ellipsoid's measure
     segment = (1 - shares)[:, None] * np.array(a) + shares[:, None] * np.array(b)
-    assert dist(place, ego) <= np.linalg.norm(segment - np.array(ego), axis=1).min() + 1e-9
+    nearest = np.linalg.norm((segment - np.array(ego)) * scale, axis=1).min()
+    assert np.linalg.norm((np.array(place) - np.array(ego)) * scale) <= nearest + 1e-9
     share = dist(place, a) / dist(a, b) if dist(a, b) > 1e-4 else 0.0
     assert velocity == pytest.approx([(1 - share) * x for x in v], abs=1e-5)
+
+
+@PROPERTY
+@given(level, level, level)
+def test_flying_along_a_lost_peers_segment_carries_nobody_away_from_it(ego: Ned, v: Ned, u: Ned) -> None:
+    """Beside the segment only the motion across it counts: the barrier is that of a wall."""
+    beside = Ned(ego.north, 0.5 + abs(ego.east), 0.0)
+    n = peer(Ned(20.0, 0.0, 0.0), other_end_ned_m=Ned(-20.0, 0.0, 0.0))
+    plane = half_plane(state(beside, v), ZERO, n)
+    wall = barrier_condition(
+        state(Ned(0.0, beside.east, 0.0), Ned(0.0, v.east, 0.0)), peer(ZERO), Ned(0.0, u.east, 0.0), ZERO
+    )
+    slack = plane.g_north * u.north + plane.g_east * u.east - plane.b
+    assert slack == pytest.approx(wall, abs=1e-3, rel=1e-5)
 
 
 def test_a_lost_peer_whose_ends_meet_has_one_place() -> None:
@@ -384,7 +400,7 @@ def test_speed_at_its_limit(speed: float, along: float, flown: float, acted: int
     s = applied(f, command(Ned(0.0, along, 0.0)), state(velocity=Ned(0.0, speed, 0.0)))
     assert acceleration(s) == pytest.approx((0.0, flown), abs=1e-9)
     assert hypot(s.velocity_north_m_s, s.velocity_east_m_s) <= 3.0 + 1e-9
-    assert f.counts["speed"] == (acted or int(speed >= 3.001))
+    assert f.counts["speed"] == acted
 
 
 def test_speed_limit_leaves_acceleration_across_the_velocity_alone() -> None:
@@ -419,7 +435,7 @@ def test_jerk_never_delays_avoidance() -> None:
     s = applied(f, command(Ned(2.0, 0.0, 0.0)), ego, [n])
     plane = half_plane(ego, ZERO, n)
     needed = plane.b / plane.g_north
-    assert needed < -5.0
+    assert needed < -4.0
     assert s.acceleration_north_m_s2 <= needed + 1e-3
 
 
@@ -487,7 +503,7 @@ def test_avoidance_keeps_its_direction_at_the_acceleration_limit() -> None:
     ego, n = state(velocity=Ned(2.0, 0.0, 0.0)), peer(Ned(1.5, 0.0, 0.0))
     plane = half_plane(ego, ZERO, n)
     needed = plane.b / plane.g_north
-    assert -7.9 < needed < -5.0
+    assert -7.9 < needed < -4.0
     f = SafetyFilter(limits)
     s = applied(f, command(Ned(0.0, 8.0, 0.0)), ego, [n])
     assert hypot(*acceleration(s)) <= 8.0 + 1e-9
@@ -549,7 +565,7 @@ class Flyer:
 
 
 def fly(flyers: list[Flyer], seconds: float, obstacles: Callable[[float], list[Neighbour]] | None = None) -> float:
-    """All fly by their laws through their filters; returns the smallest distance of any two, or of one to an obstacle."""
+    """All fly by their laws through their filters; returns the smallest distance of any two or to an obstacle."""
     nearest = inf
     for k in range(round(seconds / DT_S)):
         t = k * DT_S
@@ -664,15 +680,17 @@ def test_a_column_of_followers_passes_it_one_after_the_other(barrier: bool) -> N
             assert f.position == pytest.approx([45.0 - 3.0 * k, 0.0, -10.0], abs=0.3)
 
 
-@pytest.mark.parametrize("count", [3, 5, 8])
-def test_vehicles_that_change_places_across_a_circle_arrive(count: int) -> None:
-    """The symmetrical case in which filters of this kind block each other."""
+@pytest.mark.parametrize(("count", "seed"), [(3, 0), (5, 1), (8, 2)])
+def test_vehicles_that_change_places_across_a_circle_arrive(count: int, seed: int) -> None:
+    """All want through the middle at once, some centimetres off a perfect symmetry, which would stop them for ever."""
+    rng = random.Random(seed)
     flyers = []
     for k in range(count):
-        place = 6.0 * np.array([cos(2 * pi * k / count), sin(2 * pi * k / count), 0.0])
+        angle = 2 * pi * k / count
+        place = np.array([6.0 * cos(angle) + rng.gauss(0, 0.05), 6.0 * sin(angle) + rng.gauss(0, 0.05), 0.0])
         flyers.append(Flyer(place, np.zeros(3), toward(resting(*-place), 1.0), SafetyFilter(LIMITS)))
     targets = [-f.position for f in flyers]
-    assert fly(flyers, 60.0) >= 0.95
+    assert fly(flyers, 40.0) >= 0.98
     assert max(float(np.linalg.norm(f.position - x)) for f, x in zip(flyers, targets, strict=True)) < 0.2
 
 

@@ -1,4 +1,4 @@
-"""Drives one stand-in autopilot in virtual time, as a companion on its link would: sends messages, keeps the answers."""
+"""Drives one stand-in autopilot in virtual time, as a companion would: sends messages, keeps the answers."""
 
 import math
 import os
@@ -15,6 +15,7 @@ from sim.px4.modes import Mode
 
 ORIGIN = Geodetic(47.3977415, 8.5455929, 489.69)
 """the recorded vehicle's own origin"""
+HERE = Ned(0.0, 0.0, 0.0)
 UTC_OFFSET_NS = 1_795_300_524_000_000_000
 SECOND_NS = 1_000_000_000
 CALM = GustParameters(sigma_m_s2=0.0)
@@ -28,7 +29,7 @@ WATCHED = (
 )
 VELOCITY_AND_YAW = 0x9C7
 VELOCITY_ACCELERATION_AND_YAW = 0x807
-VELOCITY = 0xDC7 & ~(1 << 9) | 1 << 11
+VELOCITY = 0xDC7
 POSITION_AND_YAW = 0x9F8
 ACCELERATION_AND_YAW = 0x83F
 
@@ -43,12 +44,13 @@ class Flight:
         dynamics: DynamicsParameters | None = None,
         gust: GustParameters = CALM,
         noise: NoiseParameters = EXACT,
-        home_ned_m: Ned = Ned(0.0, 0.0, 0.0),  # noqa: B008
-        ekf_origin_offset_m: Ned = Ned(0.0, 0.0, 0.0),  # noqa: B008
+        home_ned_m: Ned = HERE,
+        ekf_origin_offset_m: Ned = HERE,
         boot_s: float = 0.0,
         seed: int = 1,
         quiet: bool = True,
     ) -> None:
+        self.boot_s = boot_s
         self.now_ns = round(boot_s * SECOND_NS)
         self.autopilot = Autopilot(
             system_id=1,
@@ -141,15 +143,11 @@ class Flight:
         main, sub = mode.value
         return self.command(mavlink.MAV_CMD_DO_SET_MODE, 1, main, sub)
 
-    def set_parameter(self, name: str, value: float | int) -> None:
-        """As a launcher would, before flight; not over the link."""
-        self.autopilot.parameters.set_directly(name, value)
-
     # Flight
 
     def take_off(self, height_m: float = 5.0) -> None:
         """From boot to hovering in LOITER."""
-        self.run_until(max(self.now_s, self.autopilot.boot_s + 4.2))
+        self.run_until(max(self.now_s, self.boot_s + 4.2))
         assert self.arm() == 0
         altitude = self.autopilot.telemetry.altitude_amsl_m + height_m
         assert self.command(mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, math.nan, 0, 0, altitude) == 0

@@ -1,0 +1,285 @@
+"""Real PX4 SITL instances (SIH quadrotor, headless) in the place of stubs: started, parametrised, watched, ended.
+
+PX4 takes instance numbers: instance i has system id i + 1 and speaks to UDP 14540 + i; past ten it would send all to
+14549, so those get one more MAVLink link by the port rule of `companion.config`. The simulator's truth comes as
+HIL_STATE_QUATERNION on 19410 + i, the state of arming and mode from the ground station's link on 14550.
+"""
+
+import os
+import select
+import shutil
+import signal
+import socket
+import subprocess
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from math import hypot
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from companion.config import FleetConfig, Vehicle, autopilot_port, companion_port
+from companion.core.frames import Geodetic, Ned, geodetic_to_ned, ned_to_geodetic
+from companion.errors import CompanionError
+from companion.wire.mavlink import dialect as mavlink
+from companion.wire.mavlink import parameter_value
+from sim.stubs import TRUTH_DTYPE
+
+GCS_PORT = 14550
+GCS_PORT_OF_INSTANCE = 18570
+TRUTH_PORT = 19410
+PX4_PORTS = 10
+"""instances for which PX4's own scripts open an offboard link of their own"""
+STARTUP_TIMEOUT_S = 30.0
+END_TIMEOUT_S = 6.0
+FLUSH_INTERVAL_NS = 500_000_000
+SIH_QUADROTOR = 10040
+FLEET_PARAMETERS: Mapping[str, float | int] = {
+    "COM_OBL_RC_ACT": 4,
+    "COM_RC_OVERRIDE": 3,
+    "COM_RC_IN_MODE": 4,
+    "NAV_RCL_ACT": 0,
+    "NAV_DLL_ACT": 0,
+    "COM_RCL_EXCEPT": 4,
+    "SDLOG_MODE": -1,
+}
+"""a fleet without RC: land when the setpoints end; no stick input; no log on disk"""
+
+
+@dataclass(frozen=True, slots=True)
+class SitlSettings:
+    """How to run the instances."""
+
+    build: Path
+    """PX4's build folder: holds bin/px4 and etc/"""
+    folder: Path
+    """where each instance gets its own working folder"""
+    truth_path: Path
+    stop_fd: int
+    parameters: Mapping[str, float | int]
+    """beyond FLEET_PARAMETERS"""
+
+
+def check_build(build: Path) -> Path:
+    """The build folder, or CompanionError that says what it needs to hold."""
+    if not (build / "bin" / "px4").is_file() or not (build / "etc").is_dir():
+        raise CompanionError(
+            f"--px4 {build}: is no PX4 build folder (needs bin/px4 and etc/). Get PX4-Autopilot v1.16 from its "
+            "project, run `make px4_sitl_default` there and pass build/px4_sitl_default"
+        )
+    return build.resolve()
+
+
+class _Instance:
+    """One PX4 process with its truth socket."""
+
+    def __init__(self, config: FleetConfig, vehicle: Vehicle, settings: SitlSettings) -> None:
+        self.vehicle = vehicle
+        self.index = vehicle.instance
+        if vehicle.system_id != self.index + 1:
+            raise CompanionError(
+                f"vehicle {vehicle.id}: PX4 instance {self.index} has system id {self.index + 1}, "
+                f"fleet.toml says {vehicle.system_id}"
+            )
+        self.truth_socket = _bind(TRUTH_PORT + self.index, f"vehicle {vehicle.id}'s truth")
+        home = ned_to_geodetic(Ned(vehicle.pad_north_m, vehicle.pad_east_m, 0.0), config.origin)
+        folder = settings.folder / f"px4-{vehicle.id}"
+        folder.mkdir(parents=True)
+        parameters = {**FLEET_PARAMETERS, **settings.parameters}
+        environment = {
+            **{k: v for k, v in os.environ.items() if not k.startswith("PX4_")},
+            "PX4_SIM_MODEL": "sihsim_quadx",
+            "PX4_SYS_AUTOSTART": str(SIH_QUADROTOR),
+            "PX4_HOME_LAT": f"{home.latitude_deg:.9f}",
+            "PX4_HOME_LON": f"{home.longitude_deg:.9f}",
+            "PX4_HOME_ALT": f"{home.altitude_amsl_m:.3f}",
+            **{f"PX4_PARAM_{name}": str(value) for name, value in parameters.items()},
+        }
+        self.parameters = parameters
+        self.build = settings.build
+        with (folder / "px4.log").open("wb") as log:
+            self.process = subprocess.Popen(
+                [str(settings.build / "bin" / "px4"), "-i", str(self.index), "-d", str(settings.build / "etc"), "-w",
+                 str(folder)],
+                cwd=folder, env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )  # fmt: skip
+        self.armed = False
+        self.custom_mode = 0
+        self.landed_state = 1
+        self.checked: dict[str, float | int] = {}
+
+    def open_offboard_link(self) -> None:
+        """Past ten instances: a link of its own, since PX4's scripts would send all to one port."""
+        subprocess.run(
+            [str(self.build / "bin" / "px4-mavlink"), "--instance", str(self.index), "start", "-x", "-u",
+             str(autopilot_port(self.index)), "-r", "4000000", "-f", "-m", "onboard", "-o",
+             str(companion_port(self.index))],
+            check=True, capture_output=True, timeout=10,
+        )  # fmt: skip
+
+    def end(self) -> None:
+        """SIGTERM, then SIGKILL."""
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGTERM)
+
+
+def _bind(port: int, whose: str) -> socket.socket:
+    s = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        s.bind(("127.0.0.1", port))
+    except OSError as error:
+        s.close()
+        raise CompanionError(f"cannot listen on UDP 127.0.0.1:{port} for {whose}: {error.strerror}") from error
+    s.setblocking(False)
+    return s
+
+
+class SitlHost:
+    """Runs the instances until its standard input ends, recording the simulators' truth."""
+
+    def __init__(self, config: FleetConfig, settings: SitlSettings) -> None:
+        self.config = config
+        self.settings = settings
+        self._stack = ExitStack()
+        self._mav: Any = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
+        self._mav.robust_parsing = True
+        self._flushed_ns = 0
+        try:
+            self._gcs = _bind(GCS_PORT, "the instances' state (is a ground station running?)")
+            self._stack.callback(self._gcs.close)
+            self._file = self._stack.enter_context(settings.truth_path.open("ab"))
+            self.instances: list[_Instance] = []
+            for vehicle in config.vehicles:
+                instance = _Instance(config, vehicle, settings)
+                self._stack.callback(instance.truth_socket.close)
+                self._stack.callback(self._finish, instance)
+                self.instances.append(instance)
+        except BaseException:
+            self._stack.close()
+            raise
+        self._by_system = {i.vehicle.system_id: i for i in self.instances}
+
+    def _finish(self, instance: _Instance) -> None:
+        instance.end()
+        try:
+            instance.process.wait(END_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            instance.process.kill()
+            instance.process.wait()
+        shutil.rmtree(f"/tmp/px4-sock-{instance.index}", ignore_errors=True)
+
+    def run(self, grace_s: float) -> None:
+        """Serve until the launcher is gone or says so; then leave the vehicles `grace_s` for their landing commands."""
+        ended: list[bool] = []
+        for s in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(s, lambda *_: ended.append(True))
+        with self._stack:
+            self._read_back_parameters()
+            for instance in self.instances:
+                if instance.index >= PX4_PORTS:
+                    instance.open_offboard_link()
+            until: float | None = None
+            stop_fds = [self.settings.stop_fd]
+            while until is None or time.monotonic() < until:
+                if self._serve(0.1, stop_fds) or ended:
+                    ended.clear()
+                    stop_fds = []
+                    until = time.monotonic() + (grace_s if until is None else 0.0)
+            for instance in self.instances:
+                instance.end()
+
+    def _serve(self, timeout_s: float, stop_fds: Sequence[int]) -> bool:
+        sockets: list[Any] = [self._gcs, *(i.truth_socket for i in self.instances)]
+        ready, _, _ = select.select([*sockets, *stop_fds], [], [], timeout_s)
+        if self._gcs in ready:
+            self._read_states()
+        for instance in self.instances:
+            if instance.truth_socket in ready:
+                self._read_truth(instance)
+        return any(fd in ready and not os.read(fd, 4096) for fd in stop_fds)
+
+    def _messages(self, s: socket.socket) -> list[Any]:
+        found: list[Any] = []
+        while True:
+            try:
+                data = s.recv(2048)
+            except BlockingIOError:
+                return found
+            except ConnectionError:
+                continue
+            found += self._mav.parse_buffer(data) or []
+
+    def _read_states(self) -> None:
+        for message in self._messages(self._gcs):
+            instance = self._by_system.get(message.get_srcSystem())
+            if instance is None or message.get_srcComponent() != 1:
+                continue
+            match message:
+                case mavlink.MAVLink_heartbeat_message():
+                    instance.armed = bool(message.base_mode & 128)
+                    instance.custom_mode = message.custom_mode
+                case mavlink.MAVLink_current_mode_message():
+                    instance.custom_mode = message.custom_mode
+                case mavlink.MAVLink_extended_sys_state_message():
+                    instance.landed_state = message.landed_state
+                case mavlink.MAVLink_param_value_message():
+                    instance.checked[message.param_id.rstrip("\x00")] = parameter_value(message)
+
+    def _read_truth(self, instance: _Instance) -> None:
+        rows = []
+        for message in self._messages(instance.truth_socket):
+            if isinstance(message, mavlink.MAVLink_hil_state_quaternion_message):
+                point = Geodetic(message.lat * 1e-7, message.lon * 1e-7, message.alt * 1e-3)
+                row = np.zeros((), TRUTH_DTYPE)
+                row["time_unix_ns"] = time.time_ns()
+                row["vehicle_id"] = instance.vehicle.id
+                row["armed"], row["landed_state"] = instance.armed, instance.landed_state
+                row["custom_mode"] = instance.custom_mode
+                row["position_ned_m"] = geodetic_to_ned(point, self.config.origin)
+                row["velocity_ned_m_s"] = (message.vx * 1e-2, message.vy * 1e-2, message.vz * 1e-2)
+                row["setpoint_gap_max_s"] = np.nan
+                row["attitude_rate_rad_s"] = hypot(message.rollspeed, message.pitchspeed)
+                rows.append(row.tobytes())
+        self._file.write(b"".join(rows))
+        now_ns = time.monotonic_ns()
+        if now_ns - self._flushed_ns > FLUSH_INTERVAL_NS:
+            self._flushed_ns = now_ns
+            self._file.flush()
+
+    def _read_back_parameters(self) -> None:
+        """Every parameter set at the start must have arrived; CompanionError names vehicle and parameter if not."""
+        deadline = time.monotonic() + STARTUP_TIMEOUT_S
+        while time.monotonic() < deadline:
+            missing = {i.vehicle.id: _missing(i) for i in self.instances}
+            if not any(missing.values()):
+                return
+            for instance in self.instances:
+                if instance.process.poll() is not None:
+                    raise CompanionError(f"vehicle {instance.vehicle.id}: PX4 ended at its start; see its px4.log")
+                for name in _missing(instance):
+                    request = mavlink.MAVLink_param_request_read_message(
+                        instance.vehicle.system_id, 1, name.encode(), -1
+                    )
+                    address = ("127.0.0.1", GCS_PORT_OF_INSTANCE + instance.index)
+                    self._gcs.sendto(request.pack(self._mav), address)
+            until = time.monotonic() + 0.5
+            while time.monotonic() < until:
+                if self._serve(0.1, [self.settings.stop_fd]):
+                    return
+        raise CompanionError(f"PX4 parameters not as set after {STARTUP_TIMEOUT_S:.0f} s: {missing}")
+
+
+def _missing(instance: _Instance) -> dict[str, float | int | None]:
+    """Parameters that were not read back as set, with what was read."""
+    return {
+        name: instance.checked.get(name)
+        for name, value in instance.parameters.items()
+        if name not in instance.checked or abs(instance.checked[name] - value) > 1e-6
+    }
+
+
+__all__ = ["SitlHost", "SitlSettings", "check_build"]
