@@ -67,6 +67,11 @@ CATCH_UP_NS = 1_000_000_000
 FLYING = frozenset({Phase.ARMED, Phase.CLIMBING, Phase.FORMING, Phase.FORMED, Phase.LANDING})
 
 
+def adoption_note(motion: Motion) -> str:
+    """What a vehicle logs when it adopts a motion; the summary knows by it which motions were flown."""
+    return f"motion {motion.revision} ({motion.shape}) by {motion.issuer or 'the operator'}"
+
+
 @dataclass(slots=True)
 class Tick:
     """What one control tick did, for the log and the live table."""
@@ -151,7 +156,7 @@ class Agent:
     # -- inputs ------------------------------------------------------------------------------------------------------
 
     def receive_mavlink(self, datagram: bytes, now: Instant) -> bool:
-        """Bytes of one datagram from the autopilot's link; tells whether it was our autopilot's heartbeat or position."""
+        """Bytes of one datagram from the link; whether it was the own autopilot's heartbeat or position."""
         heard = self.autopilot.heard
         if self.autopilot.receive(datagram, now):
             self._position_came = True
@@ -302,7 +307,7 @@ class Agent:
             self._happened(PhaseEvent.UNSETTLED, now)
         self._plan_due_ns = now.monotonic_ns if motion.issuer == self.id else None
         self._announce(now)
-        self._outputs.notes.append(f"motion {motion.revision} ({motion.shape}) by {motion.issuer or 'the operator'}")
+        self._outputs.notes.append(adoption_note(motion))
 
     def _compare_motions(self, message: PeerMessage, now: Instant) -> None:
         theirs = (message.sample.revision, message.motion_start_ns, message.motion_issuer)

@@ -181,6 +181,9 @@ class AutopilotClient:
             self.counts["answer to nothing asked"] += 1
             return
         request = queue[0]
+        if request.withdrawn:
+            queue.popleft()
+            return
         if event.result in (TEMPORARILY_REJECTED, IN_PROGRESS) and request.tries < TRIES:
             request.next_ns = now.monotonic_ns + round(RETRY_S * 1e9)
             return

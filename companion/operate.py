@@ -66,20 +66,20 @@ class Operator:
 
     def status(self, timeout_s: float = STATUS_TIMEOUT_S) -> dict[int, dict[str, Any] | None]:
         """Each vehicle's own account of itself; None from the silent."""
-        answers = self.link.ask(self.ids, "status", b"", timeout_s, RETRY_S)
-        return {i: None if a is None else json.loads(a) for i, a in answers.items()}
+        return {i: _object(a) for i, a in self.link.ask(self.ids, "status", b"", timeout_s, RETRY_S).items()}
 
     def command(self, verb: str, **more: object) -> Answers:
         """A verb to every vehicle, asked again until each has answered or the time is over."""
         payload = json.dumps({"verb": verb, **more}).encode()
         accepted, refused, silent = [], {}, []
         for i, answer in self.link.ask(self.ids, "command", payload, ANSWER_TIMEOUT_S, RETRY_S).items():
-            if answer is None:
+            said = _object(answer)
+            if said is None:
                 silent.append(i)
-            elif (said := json.loads(answer))["accepted"]:
+            elif said.get("accepted") is True:
                 accepted.append(i)
             else:
-                refused[i] = said["reason"]
+                refused[i] = str(said.get("reason"))
         return Answers(tuple(accepted), refused, tuple(silent))
 
     def take_off(self) -> Answers:
@@ -145,6 +145,15 @@ class Operator:
 
     def _send(self, motion: Motion) -> Answers:
         return self.command("motion", motion=json.loads(encode_motion(motion)))
+
+
+def _object(answer: bytes | None) -> dict[str, Any] | None:
+    """An answer's JSON object; None from the silent, and from whoever answers anything else."""
+    try:
+        said = None if answer is None else json.loads(answer)
+    except (ValueError, RecursionError):
+        return None
+    return said if isinstance(said, dict) else None
 
 
 def velocity_leg(north_m_s: float, east_m_s: float, up_m_s: float) -> VelocityLeg:

@@ -34,6 +34,8 @@ def _default_file(path: Path) -> Path:
 def _resize(tables: dict[str, Any], count: int) -> None:
     """The first `count` vehicles of the file, and new ones after the last."""
     listed = tables.get("vehicle", [])
+    if not isinstance(listed, list) or not all(isinstance(v, dict) for v in listed):
+        return  # the validation says what is wrong
     taken = {v.get("id") for v in listed}
     free = (i for i in range(1, 251) if i not in taken)
     tables["vehicle"] = [*listed[:count], *({"id": next(free)} for _ in range(count - len(listed)))]
@@ -45,10 +47,12 @@ def _tables(
     def change(tables: dict[str, Any]) -> None:
         if vehicles is not None:
             _resize(tables, vehicles)
-        if formation is not None:
-            tables.setdefault("formation", {})["shape"] = formation
-        if plan is not None:
-            tables.setdefault("plan", {})["legs"] = plan_legs(plan)
+        for table, key, value in (
+            ("formation", "shape", formation),
+            ("plan", "legs", None if plan is None else plan_legs(plan)),
+        ):
+            if value is not None and isinstance(tables.setdefault(table, {}), dict):
+                tables[table][key] = value
 
     return read_tables(_default_file(path), change)
 

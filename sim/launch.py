@@ -30,6 +30,8 @@ READY_TIMEOUT_S = 30.0
 READY_TIMEOUT_PER_VEHICLE_S = 3.0
 LANDING_TIMEOUT_S = 90.0
 POLL_S = 1.0
+TAKE_OFF_GRACE_S = 15.0
+"""a vehicle that is still on the ground by then has given its take-off up"""
 END_TIMEOUT_S = 5.0
 AUTOPILOTS_GRACE_S = 12.0
 LIBRARIES = ("starling-fleet", "pymavlink", "eclipse-zenoh", "numpy", "scipy", "pydantic", "mcap")
@@ -89,10 +91,10 @@ class FleetProcesses:
         """Exit status of a child that has ended, else None."""
         return self.children[name].process.poll()
 
-    def log_tail(self, name: str, lines: int = 5) -> str:
-        """The last lines that a child has printed."""
-        text = (self.folder / f"{name}.log").read_text(errors="replace").strip().splitlines()
-        return "\n".join(text[-lines:])
+    def obituary(self, name: str, when: str) -> str:
+        """What to say of a child that has ended: its exit status and the last lines that it printed."""
+        lines = (self.folder / f"{name}.log").read_text(errors="replace").strip().splitlines()
+        return "\n".join((f"{name} ended {when} with status {self.exit_status(name)}:", *lines[-5:]))
 
     def end(self, names: list[str], timeout_s: float) -> None:
         """SIGTERM to each, and SIGKILL to whoever is still there after the timeout."""
@@ -141,7 +143,7 @@ def fly(
     """
     config = parse(tables, "fleet.toml")
     folder = options.folder
-    (folder / "fleet.toml").write_text(tomli_w.dumps(_without_none(tables)))
+    _write(folder / "fleet.toml", tomli_w.dumps(_without_none(tables)))
     processes = FleetProcesses(folder)
     try:
         return _fly(config, options, processes, show, interrupted)
@@ -206,9 +208,20 @@ def _fly(
         flight.rejected += Counter(said["rejected"] if said else {})
     rows = read_reference_loop(folder / "reference.bin")
     flight.reference_lateness_ns = rows[rows[:, 0] >= takeoff_ns, 1].astype(float)
-    summary = {**summarise(flight), "folder": str(folder)}
-    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    summary = {
+        **summarise(flight),
+        "exit_status": {i: processes.exit_status(f"companion-{i}") for i in ids},
+        "folder": str(folder),
+    }
+    _write(folder / "summary.json", json.dumps(summary, indent=2) + "\n")
     return summary
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise CompanionError(f"cannot write {path}: {error.strerror}") from error
 
 
 @dataclass(slots=True)
@@ -240,7 +253,7 @@ class _Watch:
         while True:
             for name in self.processes.children:
                 if self.processes.exit_status(name) is not None:
-                    raise CompanionError(f"{name} ended before take-off:\n{self.processes.log_tail(name)}")
+                    raise CompanionError(self.processes.obituary(name, "before take-off"))
             answers = self._look("starting")
             waiting = {i: ["silent"] if s is None else s["ready"] for i, s in answers.items()}
             if all(not reasons for reasons in waiting.values()):
@@ -262,7 +275,11 @@ class _Watch:
             staying = [s for i, s in answers.items() if i not in lost and s is not None]
             if len(lost) == len(self.ids):
                 return lost
-            done = [s["phase"] in ("landed", "released") and not s["armed"] for s in staying]
+            if "autopilots" in self.processes.children and self.processes.exit_status("autopilots") is not None:
+                raise CompanionError(self.processes.obituary("autopilots", "in flight"))
+            tried = time.monotonic() - start > TAKE_OFF_GRACE_S
+            down = ("landed", "released", "idle") if tried else ("landed", "released")
+            done = [s["phase"] in down and not s["armed"] for s in staying]
             if staying and all(done) and len(staying) + len(lost) == len(self.ids):
                 return lost
             over = duration_s is not None and time.monotonic() - start >= duration_s

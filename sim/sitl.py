@@ -86,7 +86,7 @@ class _Instance:
             )
         self.truth_socket = _bind(TRUTH_PORT + self.index, f"vehicle {vehicle.id}'s truth")
         home = ned_to_geodetic(Ned(vehicle.pad_north_m, vehicle.pad_east_m, 0.0), config.origin)
-        folder = settings.folder / f"px4-{vehicle.id}"
+        folder = settings.folder.resolve() / f"px4-{vehicle.id}"  # PX4 changes its folder before it reads this
         folder.mkdir(parents=True)
         parameters = {**FLEET_PARAMETERS, **settings.parameters}
         environment = {

@@ -107,13 +107,16 @@ class _TruthRecorder:
             row["velocity_ned_m_s"] = state.velocity_ned_m_s
             row["setpoint_gap_max_s"] = state.setpoint_gap_max_s
             row["attitude_rate_rad_s"] = np.nan
-        self._file.write(rows.tobytes())
-        if now_ns - self._flushed_ns >= FLUSH_INTERVAL_NS:
-            self._flushed_ns = now_ns
-            self._file.flush()
+        # A full disk ends the record, not the flight.
+        with suppress(OSError):
+            self._file.write(rows.tobytes())
+            if now_ns - self._flushed_ns >= FLUSH_INTERVAL_NS:
+                self._flushed_ns = now_ns
+                self._file.flush()
 
     def close(self) -> None:
-        self._file.close()
+        with suppress(OSError):
+            self._file.close()
 
 
 class _Link:

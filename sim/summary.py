@@ -12,12 +12,14 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from companion.io.recorder import Entry
 
+from companion.agent import adoption_note
 from companion.config import FleetConfig
 from companion.core.monitor import algebraic_connectivity, centroid_error_m, formation_error_m, velocity_error_m_s
 from companion.core.plan import Motion, Programme
+from companion.errors import WireError
 from companion.io.loop import TICK_RECORD, TRAFFIC_RECORD
+from companion.io.recorder import Entry
 from companion.wire.mavlink import Px4Mode
 from companion.wire.peer import decode_motion
 
@@ -97,14 +99,20 @@ class Flight:
             self.motions.append(decode_motion(payload))
 
     def _command(self, body: bytes) -> None:
-        command = json.loads(body)
-        if command.get("verb") == "motion":
-            self.motions.append(decode_motion(json.dumps(command["motion"]).encode()))
+        try:
+            command = json.loads(body)
+            if command["verb"] == "motion":
+                self.motions.append(decode_motion(json.dumps(command["motion"]).encode()))
+        except (ValueError, KeyError, TypeError, RecursionError, WireError):
+            return  # the vehicle has refused and counted it
 
     def programme(self) -> Programme:
-        """The motions that won, one of each revision."""
+        """The motions that won, one of each revision; what every vehicle refused is not among them."""
         best: dict[int, Motion] = {0: self.config.first_motion}
+        adopted = {text for _, _, text in self.notes}
         for motion in self.motions:
+            if adoption_note(motion) not in adopted:
+                continue
             if motion.revision not in best or motion.order > best[motion.revision].order:
                 best[motion.revision] = motion
         return Programme([best[r] for r in sorted(best)])

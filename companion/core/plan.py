@@ -258,6 +258,9 @@ class Moment(NamedTuple):
         df, dr, dd = f1 - f0, r1 - r0, d1 - d0
         forward, right = f0 + m * df, r0 + m * dr
         dn, de = c * forward - s * right, s * forward + c * right
+        if rate == bend == m1 == m2 == 0.0:
+            # Slots at rest in a formation that does not turn, which is most of a flight: all move as the centre does.
+            return Reference(Ned(p.north + dn, p.east + de, p.down + d0 + m * dd), v, a, heading)
         wn, we = c * df - s * dr, s * df + c * dr
         return Reference(
             Ned(p.north + dn, p.east + de, p.down + d0 + m * dd),

@@ -1,0 +1,87 @@
+"""The host of the stand-in autopilots: ports, truth, signals, and the end of its launcher."""
+
+import os
+import signal
+import socket
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import development as mavlink
+from stub_process import fleet, launched, listening, running
+
+from companion.errors import CompanionError
+from sim.stubs import TRUTH_DTYPE, run_stubs
+
+pytestmark = pytest.mark.process
+
+
+def receive(companion: socket.socket) -> list[mavlink.MAVLink_message]:
+    parser = mavlink.MAVLink(None)
+    parser.robust_parsing = True
+    return list(parser.parse_buffer(companion.recv(2048)) or ())
+
+
+def test_autopilot_sends_from_its_port_to_its_companions_port_only() -> None:
+    settings = fleet(1)
+    vehicle = settings.vehicles[0]
+    with listening(vehicle.companion_port) as companion, running(settings):
+        datagram, source = companion.recvfrom(2048)
+        assert source == ("127.0.0.1", vehicle.autopilot_port)
+        assert datagram[0] == 0xFD
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as elsewhere:
+            elsewhere.bind(("127.0.0.1", 0))
+            sender = mavlink.MAVLink(None, srcSystem=1, srcComponent=191)
+            command = mavlink.MAVLink_command_long_message(1, 1, 31999, 0, 0, 0, 0, 0, 0, 0, 0)
+            elsewhere.sendto(command.pack(sender), ("127.0.0.1", vehicle.autopilot_port))
+            while not any(message.get_type() == "COMMAND_ACK" for message in receive(companion)):
+                pass
+            elsewhere.setblocking(False)
+            with pytest.raises(BlockingIOError):
+                elsewhere.recv(2048)
+
+
+def test_busy_port_is_named_with_its_vehicle() -> None:
+    settings = fleet(2)
+    port = settings.vehicles[1].autopilot_port
+    with listening(port), pytest.raises(CompanionError, match=f"vehicle 2: UDP port {port} of its autopilot is in use"):
+        run_stubs(settings)
+
+
+def test_truth_of_every_vehicle_is_recorded_at_50_hz(tmp_path: Path) -> None:
+    settings = fleet(2, truth_path=tmp_path / "flight" / "truth.bin")
+    before_ns = time.time_ns()
+    with listening(settings.vehicles[0].companion_port) as companion, running(settings):
+        for _ in range(600):
+            companion.recv(2048)
+    rows = np.fromfile(tmp_path / "flight" / "truth.bin", TRUTH_DTYPE)
+    assert set(rows["vehicle_id"]) == {1, 2}
+    assert np.all(rows["position_ned_m"][rows["vehicle_id"] == 2] == [0.0, 3.0, 0.0])
+    times_ns = rows["time_unix_ns"][rows["vehicle_id"] == 1]
+    assert times_ns[0] >= before_ns
+    assert len(times_ns) == pytest.approx((times_ns[-1] - times_ns[0]) / 20e6, rel=0.1)
+    assert np.all(np.diff(times_ns) > 0)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_signal_ends_the_stubs_cleanly_after_the_grace(number: signal.Signals) -> None:
+    settings = fleet(1, grace_s=0.5)
+    with listening(settings.vehicles[0].companion_port) as companion, running(settings) as process:
+        companion.recv(2048)
+        assert process.pid is not None
+        asked_s = time.monotonic()
+        os.kill(process.pid, number)
+        process.join(5.0)
+        assert process.exitcode == 0
+        assert 0.45 <= time.monotonic() - asked_s < 2.0
+
+
+def test_launchers_end_is_noticed_by_its_pipe() -> None:
+    settings = fleet(1)
+    with listening(settings.vehicles[0].companion_port) as companion, launched(settings) as process:
+        companion.recv(2048)
+        assert process.poll() is None
+        assert process.stdin is not None
+        process.stdin.close()
+        assert process.wait(5.0) == 0

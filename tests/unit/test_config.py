@@ -1,0 +1,489 @@
+"""fleet.toml: what is refused, and that the refusal says where, what came and what is allowed."""
+
+import copy
+import math
+import re
+import tomllib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from companion.config import (
+    FleetConfig,
+    autopilot_port,
+    companion_port,
+    load,
+    parse,
+    serial_endpoint,
+    udp_endpoint,
+)
+from companion.core.plan import GotoLeg, TurnLeg, VelocityLeg
+from companion.errors import ConfigError
+from sim.__main__ import _resize, plan_legs
+
+DEFAULT = Path(__file__).resolve().parents[2] / "fleet.toml"
+Tables = dict[str, Any]
+Change = Callable[[Tables], None]
+NAN, INF = math.nan, math.inf
+
+
+def default_tables() -> Tables:
+    return tomllib.loads(DEFAULT.read_text(encoding="utf-8"))
+
+
+def put(path: str, value: object) -> Change:
+    """Set a value at a dotted path, with numbers for places in a list; missing tables come into being."""
+
+    def change(tables: Tables) -> None:
+        place: Any = tables
+        *parents, last = (int(p) if p.isdigit() else p for p in path.split("."))
+        for part in parents:
+            place = place.setdefault(part, {}) if isinstance(place, dict) else place[part]
+        place[last] = value
+
+    return change
+
+
+def changed(*changes: Change) -> Tables:
+    tables = default_tables()
+    for change in changes:
+        change(tables)
+    return tables
+
+
+def refusal(*changes: Change) -> str:
+    with pytest.raises(ConfigError) as caught:
+        parse(changed(*changes), "fleet.toml")
+    return str(caught.value)
+
+
+def test_the_default_file_flies_ten_vehicles_in_a_v_at_four_metres() -> None:
+    config = load(DEFAULT)
+    assert [v.id for v in config.vehicles] == list(range(1, 11))
+    assert [v.system_id for v in config.vehicles] == list(range(1, 11))
+    assert (config.formation.shape, config.formation.spacing_m) == ("v", 4.0)
+    assert config.plan_legs(config.first_motion.centre_ned_m)
+    assert config.first_motion.velocity_ned_m_s == (0.0, 0.0, 0.0)
+
+
+def leaves(value: object, path: str = "") -> Iterator[tuple[str, object]]:
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield from leaves(item, f"{path}.{key}" if path else key)
+    elif isinstance(value, list):
+        for k, item in enumerate(value):
+            yield from leaves(item, f"{path}.{k}")
+    else:
+        yield path, value
+
+
+def with_every_number() -> Tables:
+    """The default file with every number written out that it may leave out."""
+    tables = changed(
+        put("law.r0_m", 2.0),
+        put("peers.scouting_port", 7450),
+        put("formation.custom_m", [[4.0 * k, 0.0, 0.0] for k in range(10)]),
+        put("vehicle.0", {"id": 1, "system_id": 1, "slot": 0, "pad_m": [1.0, -20.0]}),
+    )
+    tables["plan"]["legs"].append({"kind": "goto", "north_m": 4.0, "east_m": 1.0, "altitude_m": 9.0, "speed_m_s": 1.0})
+    tables["plan"]["legs"][0].update(east_m_s=0.0, up_m_s=0.0)
+    return tables
+
+
+NUMBERS = [
+    path
+    for path, value in leaves(with_every_number())
+    if isinstance(value, int | float) and not isinstance(value, bool)
+]
+
+
+def in_file(path: str) -> str:
+    return "$" + re.sub(r"\.(\d+)", r"[\1]", "." + path)
+
+
+@pytest.mark.parametrize("path", NUMBERS)
+def test_every_number_that_is_not_finite_or_absurd_or_no_number_is_refused_by_name(path: str) -> None:
+    parse(with_every_number(), "fleet.toml")
+    for value in (NAN, INF, -INF, 1e300, -1e300, True, "4", [1.0], {}):
+        tables = with_every_number()
+        put(path, value)(tables)
+        with pytest.raises(ConfigError) as caught:
+            parse(tables, "fleet.toml")
+        text = str(caught.value)
+        assert text.startswith("fleet.toml: $")
+        assert in_file(path) in text, (path, value, text)
+        assert "got" in text
+        if not isinstance(value, list | dict):
+            assert repr(value) in text, (path, value, text)
+
+
+VELOCITY, TURN = "plan.legs.0", "plan.legs.1"
+RANGES = [
+    ("fleet.name", "Two Words", "must match"),
+    ("fleet.frame", "body", "must be 'global' or 'local'"),
+    ("fleet.origin.latitude_deg", 90.1, "a finite number >= -90 and <= 90 deg"),
+    ("fleet.origin.longitude_deg", -181.0, "a finite number >= -180 and <= 180 deg"),
+    ("fleet.origin.altitude_amsl_m", 9001, "a finite number >= -500 and <= 9000 m"),
+    ("formation.spacing_m", 0, "a finite number > 0 and <= 1000 m"),
+    ("formation.spacing_m", -4.0, "a finite number > 0 and <= 1000 m"),
+    ("formation.heading_deg", 361, "a finite number >= -360 and <= 360 deg"),
+    ("formation.altitude_m", 0.5, "a finite number >= 1 and <= 500 m"),
+    ("plan.then", "hover", "'stay' or 'land'"),
+    ("plan.heading", "north", "'fixed' or 'track'"),
+    ("plan.automatic", 1, "a valid boolean"),
+    (f"{VELOCITY}.kind", "loop", "one of hold, velocity, turn, goto"),
+    (f"{VELOCITY}.duration_s", 0, "a finite number > 0 and <= 100000 s"),
+    (f"{TURN}.rate_deg_s", 61.0, "a finite number >= -60 and <= 60 deg/s"),
+    (f"{TURN}.angle_deg", 0.0, "a finite number > 0 and <= 36000 deg"),
+    ("law.kind", "boids", "'starling' or 'paper'"),
+    ("law.hold", "second", "'damped', 'zero' or 'first'"),
+    ("law.k_s", -0.1, "a finite number >= 0 and <= 100"),
+    ("law.a_max_m_s2", 0.0, "a finite number > 0 and <= 20 m/s^2"),
+    ("trigger.kind", "always", "'error', 'switching' or 'periodic'"),
+    ("trigger.gamma_s2", 0.0, "a finite number > 0 and <= 100000 s^2"),
+    ("trigger.t_max_s", 61.0, "a finite number > 0 and <= 60 s"),
+    ("limits.speed_max_m_s", 12.1, "a finite number >= 0.2 and <= 12 m/s"),
+    ("limits.climb_max_m_s", 3.1, "a finite number > 0 and <= 3 m/s"),
+    ("limits.descent_max_m_s", 1.6, "a finite number > 0 and <= 1.5 m/s"),
+    ("limits.jerk_max_m_s3", -1.0, "a finite number > 0 and <= 1000 m/s^3"),
+    ("limits.avoidance_acceleration_m_s2", 8.5, "a finite number > 0 and <= 8 m/s^2"),
+    ("limits.barrier", "yes", "a valid boolean"),
+    ("peers.digest", 31, "a whole number >= 0 and <= 30"),
+    ("peers.digest", 2.0, "a whole number >= 0 and <= 30"),
+    ("peers.network", "mesh", "'laptop' or 'field'"),
+    ("peers.scouting_port", 80, "a whole number >= 1024 and <= 65535"),
+    ("stub.dynamics", "rigid", "'px4' or 'ideal'"),
+    ("vehicle.0.id", 0, "a whole number >= 1 and <= 250"),
+    ("vehicle.0.id", 251, "a whole number >= 1 and <= 250"),
+    ("vehicle.0.id", "one", "a whole number >= 1 and <= 250"),
+    ("vehicle.0.system_id", 0, "a whole number >= 1 and <= 250"),
+    ("vehicle.0.slot", "first", 'a whole number >= 0 and <= 249, or "auto"'),
+    ("vehicle.0.slot", -1, 'a whole number >= 0 and <= 249, or "auto"'),
+    ("vehicle.0.mavlink", "tcp://127.0.0.1:5760", "udp://HOST:PORT or serial:///dev/NAME:BAUD"),
+    ("vehicle.0.mavlink", "udp://127.0.0.1:70000", "udp://HOST:PORT or serial:///dev/NAME:BAUD"),
+    ("vehicle.0.zenoh", "127.0.0.1:7447", "PROTOCOL/HOST:PORT"),
+    ("vehicle.0.zenoh", "tcp/127.0.0.1:70000", "PROTOCOL/HOST:PORT"),
+]
+
+
+@pytest.mark.parametrize(("path", "value", "allowed"), RANGES, ids=[f"{p}={v}" for p, v, _ in RANGES])
+def test_a_value_out_of_its_range_is_refused_with_place_value_and_range(path: str, value: object, allowed: str) -> None:
+    text = refusal(put(path, value))
+    assert text.startswith(f"fleet.toml: {in_file(path)}")
+    assert allowed in text
+    assert "got" in text
+    assert "\n" not in text
+
+
+@pytest.mark.parametrize(
+    ("path", "known"),
+    [
+        ("colour", "fleet, formation, launch"),
+        ("fleet.colour", "frame, name, origin"),
+        ("fleet.origin.colour", "altitude_amsl_m, latitude_deg, longitude_deg"),
+        ("law.colour", "a_max_m_s2"),
+        ("vehicle.3.colour", "enabled, id, mavlink"),
+        (f"{VELOCITY}.colour", "duration_s, east_m_s, kind, north_m_s, up_m_s"),
+        (f"{TURN}.colour", "angle_deg, kind, rate_deg_s"),
+    ],
+)
+def test_an_unknown_key_is_refused_and_the_known_ones_are_named(path: str, known: str) -> None:
+    text = refusal(put(path, 1))
+    assert text.startswith(f"fleet.toml: {in_file(path)} is not a known key; known here: ")
+    assert known in text
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "text"),
+    [
+        (put("vehicle.1.id", 1), None, "$.vehicle[1].id must be unique, got 1 as in $.vehicle[0]"),
+        (put("vehicle.1.system_id", 1), None, "$.vehicle[1].system_id must be unique, got 1 as in $.vehicle[0]"),
+        (
+            put("vehicle.1.mavlink", "udp://0.0.0.0:14540"), None,
+            "$.vehicle[1].mavlink must be unique, got 14540 as in $.vehicle[0]",
+        ),
+        (
+            put("vehicle.0.mavlink", "serial:///dev/ttyS1:921600"), put("vehicle.1.mavlink", "serial:///dev/ttyS1:57600"),
+            "$.vehicle[1].mavlink must be unique, got '/dev/ttyS1' as in $.vehicle[0]",
+        ),
+        (
+            put("vehicle.0.zenoh", "tcp/127.0.0.1:7447"), put("vehicle.1.zenoh", "tcp/127.0.0.1:7447"),
+            "$.vehicle[1].zenoh must be unique, got 'tcp/127.0.0.1:7447' as in $.vehicle[0]",
+        ),
+        (put("vehicle.0.slot", 3), put("vehicle.1.slot", 3), "$.vehicle[1].slot must be unique, got 3"),
+    ],
+    ids=["id", "system id", "port", "serial device", "endpoint", "slot"],
+)  # fmt: skip
+def test_what_two_vehicles_share_is_refused_with_both_their_places(
+    one: Change, other: Change | None, text: str
+) -> None:
+    assert text in refusal(one, *([other] if other else []))
+
+
+def line_of(*slots: list[float]) -> Change:
+    def change(tables: Tables) -> None:
+        tables["formation"].update(shape="custom", custom_m=list(slots))
+        tables["vehicle"] = tables["vehicle"][: len(slots)]
+
+    return change
+
+
+def drop(path: str) -> Change:
+    def change(tables: Tables) -> None:
+        place: Any = tables
+        *parents, last = (int(p) if p.isdigit() else p for p in path.split("."))
+        for part in parents:
+            place = place[part]
+        del place[last]
+
+    return change
+
+
+def nobody(tables: Tables) -> None:
+    for v in tables["vehicle"]:
+        v["enabled"] = False
+
+
+def legs(*rows: dict[str, object]) -> Change:
+    return put("plan.legs", list(rows))
+
+
+ACROSS = [
+    (put("formation.spacing_m", 1.5), "$.formation.spacing_m", "the safety radius 1.46 m", "got 1.50 m"),
+    (put("law.r0_m", 5.0), "$.formation.spacing_m", "separation's range 5.00 m", "got 4.00 m"),
+    (put("formation.shape", "star"), "$.formation.shape", "v, line, column, circle, grid, spiral, sphere, custom",
+     "got 'star'"),
+    (put("formation.shape", "custom"), "$.formation.custom_m", "each of the 10 enabled vehicles", "got 0"),
+    (line_of([0.0, 0.0, 0.0], [0.5, 0.0, 3.2]), "$.formation.spacing_m", "above each other inside the downwash",
+     "larger spacing"),
+    (line_of([0.0, 0.0, 0.0], [4.0, 0.0, 30.0]), "$.formation.altitude_m", "no slot below 1 m", "got -5.00"),
+    (drop("fleet.origin"), "$.fleet.origin", "is required", "latitude_deg, longitude_deg, altitude_amsl_m"),
+    (drop("vehicle.0.id"), "$.vehicle[0].id", "is required", ""),
+    (put("vehicle", []), "$.vehicle", "at least 1", "got 0"),
+    (nobody, "$.vehicle", "at least one vehicle must be enabled", ""),
+    (put("vehicle.0.slot", 10), "$.vehicle[0].slot", "below the 10 enabled vehicles", "got 10"),
+    (put("launch.spacing_m", 1.0), "$.launch.spacing_m", "at least the safety radius 1.46 m", "got 1.00 m"),
+    (put("vehicle.0.pad_m", [-2.0, -7.5]), "$.vehicle[].pad_m", "at least the safety radius", "got"),
+    (put("trigger.t_min_s", 10.0), "$.trigger.t_min_s", "below $.trigger.t_max_s = 10 s", "got 10"),
+    (put(f"{VELOCITY}.north_m_s", 3.1), "$.plan.legs[0]", "<= 3 m/s (3/4 of $.limits.speed_max_m_s)", "got 3.1"),
+    (put(f"{VELOCITY}.up_m_s", 1.2), "$.plan.legs[0].up_m_s", "<= 1.125 m/s", "got 1.2"),
+    (put(f"{VELOCITY}.up_m_s", -0.8), "$.plan.legs[0].up_m_s", ">= -0.75", "got -0.8"),
+    (put(f"{VELOCITY}.up_m_s", -0.5), "$.plan.legs[0]", "at least 1 m above the origin", "got -2.5"),
+    (put(f"{TURN}.rate_deg_s", 0), "$.plan.legs[1].rate_deg_s", "0.01 deg/s or more", "got 0"),
+    (drop(f"{TURN}.angle_deg"), "$.plan.legs[1].angle_deg", "is required except in the last leg", ""),
+    (legs({"kind": "goto", "north_m": 5.0, "east_m": 0.0, "speed_m_s": 3.5}), "$.plan.legs[0].speed_m_s",
+     "<= 3 m/s", "got 3.5"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("change", "where", "allowed", "came"), ACROSS, ids=[w for _, w, _, _ in ACROSS])
+def test_values_that_do_not_go_together_are_refused(change: Change, where: str, allowed: str, came: str) -> None:
+    text = refusal(change)
+    assert text.startswith("fleet.toml: $")
+    assert where in text
+    assert allowed in text
+    assert came in text
+
+
+def test_all_faults_are_told_at_once_each_on_its_line() -> None:
+    lines = refusal(put("law.k_s", -1), put("formation.altitude_m", NAN), put("peers.digest", 99)).splitlines()
+    assert len(lines) == 3
+    assert all(line.startswith("fleet.toml: $.") for line in lines)
+
+
+def test_a_local_frame_needs_no_origin() -> None:
+    config = parse(changed(drop("fleet.origin"), put("fleet.frame", "local")), "fleet.toml")
+    assert config.fleet.origin is None
+
+
+def test_without_the_barrier_slots_need_only_keep_out_of_separations_range() -> None:
+    tables = changed(put("limits.barrier", False), put("formation.spacing_m", 1.0), put("launch.spacing_m", 1.0))
+    assert parse(tables, "fleet.toml").spacing_min_m == pytest.approx(0.7)
+
+
+@pytest.mark.parametrize("text", ["[fleet", "name = ", "\xff\xfe"])
+def test_a_file_that_is_no_toml_is_refused_by_name(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_bytes(text.encode("latin-1"))
+    with pytest.raises(ConfigError, match=r"mine\.toml: is not valid TOML"):
+        load(path)
+
+
+def test_a_file_that_is_not_there_is_refused_by_name(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"none\.toml: cannot be read: No such file"):
+        load(tmp_path / "none.toml")
+
+
+scalars = st.one_of(
+    st.floats(), st.integers(), st.booleans(), st.text(max_size=8), st.none(),
+    st.lists(st.floats(), max_size=3), st.dictionaries(st.text(max_size=4), st.integers(), max_size=2),
+)  # fmt: skip
+PLACES = [path for path, _ in leaves(default_tables())] + list(default_tables())
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.sampled_from(PLACES), scalars)
+def test_whatever_stands_in_one_place_the_file_loads_or_is_refused(path: str, value: object) -> None:
+    told = "fleet.toml: $"
+    try:
+        assert isinstance(parse(changed(put(path, value)), "fleet.toml"), FleetConfig)
+    except ConfigError as error:
+        told = str(error)
+    assert told.startswith("fleet.toml: $")
+
+
+@pytest.mark.parametrize(
+    ("change", "shared"),
+    [
+        (put("stub.gust_m_s2", 0.0), True),
+        (put("stub.dynamics", "ideal"), True),
+        (put("vehicle.0.mavlink", "udp://0.0.0.0:15000"), True),
+        (put("vehicle.0.zenoh", "tcp/10.0.0.1:7447"), True),
+        (put("law.k_s", 3.1), False),
+        (put("trigger.epsilon_m", 0.31), False),
+        (put("limits.gust_m_s2", 0.31), False),
+        (put("formation.spacing_m", 4.1), False),
+        (put("vehicle.0.pad_m", [0.0, -30.0]), False),
+        (put("vehicle.0.slot", 3), False),
+        (put("vehicle.9.enabled", False), False),
+        (put("fleet.name", "other"), False),
+        (put("plan.then", "stay"), False),
+    ],
+)
+def test_the_shared_hash_tells_what_vehicles_must_agree_on_and_nothing_else(change: Change, shared: bool) -> None:
+    mine = parse(default_tables(), "a.toml").shared_hash
+    theirs = parse(changed(change), "b.toml").shared_hash
+    assert (mine == theirs) is shared
+
+
+def test_a_disabled_vehicle_keeps_its_place_in_ports_and_pads() -> None:
+    everyone = parse(default_tables(), "fleet.toml")
+    fewer = parse(changed(put("vehicle.3.enabled", False)), "fleet.toml")
+    assert [v for v in everyone.vehicles if v.id != 4] == list(fewer.vehicles)
+    with pytest.raises(ConfigError, match="vehicle 4 is not an enabled vehicle"):
+        fewer.by_id(4)
+
+
+def test_ports_leave_the_ground_stations_alone() -> None:
+    assert [companion_port(k) for k in (0, 9, 10, 29)] == [14540, 14549, 24550, 24569]
+    assert [autopilot_port(k) for k in (0, 9, 10, 29)] == [14580, 14589, 25550, 25569]
+    assert 14550 not in {companion_port(k) for k in range(250)}
+
+
+@pytest.mark.parametrize(
+    ("url", "endpoint"),
+    [
+        ("udp://127.0.0.1:14540", ("127.0.0.1", 14540)), ("udp://:14540", ("0.0.0.0", 14540)),
+        ("udp://127.0.0.1", None), ("udp://127.0.0.1:0", None), ("udp://127.0.0.1:65536", None),
+        ("udp://127.0.0.1:port", None), ("udp://127.0.0.1:1/x", None), ("tcp://127.0.0.1:1", None), ("", None),
+        ("udp://[::1", None),
+    ],
+)  # fmt: skip
+def test_udp_links_are_read_or_named_as_something_else(url: str, endpoint: tuple[str, int] | None) -> None:
+    assert udp_endpoint(url) == endpoint
+
+
+def test_serial_links_are_read_or_named_as_something_else() -> None:
+    assert serial_endpoint("serial:///dev/ttyAMA0:921600") == ("/dev/ttyAMA0", 921600)
+    assert serial_endpoint("serial:///dev/ttyAMA0") is None
+    assert serial_endpoint("udp://127.0.0.1:14540") is None
+
+
+def test_pads_are_a_grid_about_the_origin_in_the_files_order() -> None:
+    vehicles = load(DEFAULT).vehicles
+    assert sum(v.pad_north_m for v in vehicles) == pytest.approx(0.0)
+    assert sum(v.pad_east_m for v in vehicles) == pytest.approx(0.0)
+    assert vehicles[0].pad_north_m - vehicles[5].pad_north_m == pytest.approx(4.0)
+    assert vehicles[1].pad_east_m - vehicles[0].pad_east_m == pytest.approx(4.0)
+
+
+def test_the_papers_law_is_selectable() -> None:
+    tables = changed(put("law.kind", "paper"), put("law.hold", "zero"), put("trigger.kind", "switching"))
+    config = parse(tables, "fleet.toml")
+    assert config.gains.normalise == 0.0
+    assert config.gains.k_p == 0.0
+    assert config.gains.a_max == 5.0
+    assert config.safety_radius_m > 0.65
+
+
+def test_legs_begin_where_the_one_before_ends() -> None:
+    tables = changed(
+        legs(
+            {"kind": "goto", "north_m": 30.0, "east_m": 40.0, "speed_m_s": 1.0},
+            {"kind": "hold", "duration_s": 3.0},
+            {"kind": "goto", "north_m": 30.0, "east_m": 40.0, "altitude_m": 20.0},
+            {"kind": "turn", "rate_deg_s": -6.0},
+        )
+    )
+    config = parse(tables, "fleet.toml")
+    away, hold, up, turn = config.plan_legs(config.first_motion.centre_ned_m)
+    assert isinstance(away, GotoLeg)
+    assert away.target_ned_m == (30.0, 40.0, -10.0)
+    assert away.duration_s == pytest.approx(1.875 * 50.0)
+    assert hold == VelocityLeg((0.0, 0.0, 0.0), 3.0)  # type: ignore[arg-type]
+    assert isinstance(up, GotoLeg)
+    assert (up.target_ned_m.down, up.duration_s) == (-20.0, pytest.approx(1.875 * 10.0))
+    assert turn == TurnLeg(math.radians(-6.0), math.inf)
+
+
+# -- overrides from the command line -----------------------------------------------------------------------------------
+
+
+def test_more_vehicles_get_the_free_ids_and_fewer_are_the_first() -> None:
+    tables = changed(put("vehicle.1.id", 12))
+    _resize(tables, 12)
+    config = parse(tables, "fleet.toml")
+    assert [v.id for v in config.vehicles] == [1, 12, 3, 4, 5, 6, 7, 8, 9, 10, 2, 11]
+    _resize(tables, 3)
+    assert [v["id"] for v in tables["vehicle"]] == [1, 12, 3]
+
+
+def test_as_many_vehicles_as_there_are_ids_can_be_asked_for() -> None:
+    tables = default_tables()
+    _resize(tables, 250)
+    assert sorted(v["id"] for v in tables["vehicle"]) == list(range(1, 251))
+
+
+@pytest.mark.parametrize("value", [5, "ten", [1, 2], {"id": 1}])
+def test_a_list_of_vehicles_that_is_none_is_left_to_the_validation(value: object) -> None:
+    tables = changed(put("vehicle", value))
+    _resize(tables, 3)
+    assert tables["vehicle"] == value
+    with pytest.raises(ConfigError, match=r"\$\.vehicle"):
+        parse(tables, "fleet.toml")
+
+
+def test_legs_from_the_command_line_are_those_of_the_file() -> None:
+    text = "hold:10,velocity:1:-0.5:20,turn:6:90,turn:-3,goto:40:0:1.5,goto:1:2"
+    assert plan_legs(text) == [
+        {"kind": "hold", "duration_s": 10.0},
+        {"kind": "velocity", "north_m_s": 1.0, "east_m_s": -0.5, "duration_s": 20.0},
+        {"kind": "turn", "rate_deg_s": 6.0, "angle_deg": 90.0},
+        {"kind": "turn", "rate_deg_s": -3.0},
+        {"kind": "goto", "north_m": 40.0, "east_m": 0.0, "speed_m_s": 1.5},
+        {"kind": "goto", "north_m": 1.0, "east_m": 2.0},
+    ]
+    assert plan_legs("none") == []
+
+
+@pytest.mark.parametrize(
+    "text", ["", "fly:1", "hold", "hold:", "hold:x", "hold:1:2", "velocity:1:2", "turn:1:2:3", ","]
+)
+def test_legs_that_cannot_be_read_are_refused_with_the_form(text: str) -> None:
+    with pytest.raises(ConfigError, match="--plan: leg"):
+        plan_legs(text)
+
+
+def test_legs_from_the_command_line_are_checked_as_those_of_the_file() -> None:
+    assert "$.plan.legs[0].duration_s must be a finite number" in refusal(put("plan.legs", plan_legs("hold:nan")))
+
+
+def test_the_default_tables_are_not_touched_by_parsing() -> None:
+    tables = default_tables()
+    before = copy.deepcopy(tables)
+    parse(tables, "fleet.toml")
+    assert tables == before
