@@ -1,5 +1,6 @@
 """Command `companion`: one vehicle's companion process."""
 
+import os
 import sys
 from importlib.metadata import version
 from pathlib import Path
@@ -34,7 +35,8 @@ def run(
     from companion.io.loop import Companion, RunSettings
 
     def log(text: str) -> None:
-        print(f"vehicle {vehicle}: {text}", flush=True)  # noqa: T201 - the process's log
+        # Not through a buffer, which on a full disk would fail again at the end and change the exit status.
+        os.write(1, f"vehicle {vehicle}: {text}\n".encode())
 
     config = load(fleet)
     settings = RunSettings(vehicle, record, sys.stdin.fileno() if launched else None, log)

@@ -19,7 +19,9 @@ TRIES = 8
 HEARTBEAT_LIMIT_S = 3.0
 POSITION_LIMIT_S = 0.5
 """a position older than this is stale: no setpoint is made from it"""
-LATENCY_WINDOW_NS = 5_000_000_000
+LATENCY_WINDOW_NS = 1_000_000_000
+"""short, since a simulated autopilot's clock may run several per cent slow: what it falls behind within the window
+counts as delay"""
 ESTIMATOR_FLAGS_NEEDED = 1 | 2 | 4
 """ESTIMATOR_STATUS: attitude, horizontal and vertical velocity"""
 ESTIMATOR_GLOBAL_FLAG = 16
@@ -80,6 +82,7 @@ class AutopilotClient:
         self.armed = False
         self.custom_mode = 0
         self.autopilot_kind = -1
+        self.vehicle_type = -1
         self.landed_state = 0
         self.battery_percent = -1
         self.estimator_flags = 0
@@ -135,6 +138,7 @@ class AutopilotClient:
         self.armed = event.armed
         self.custom_mode = event.custom_mode
         self.autopilot_kind = event.autopilot
+        self.vehicle_type = event.vehicle_type
         if first:
             self._set_up()
 
@@ -274,6 +278,8 @@ class AutopilotClient:
             reasons.append(f"no heartbeat for {(now.monotonic_ns - self.heartbeat_ns) * 1e-9:.0f} s")
         if self.autopilot_kind != wire.AUTOPILOT_PX4:
             reasons.append(f"autopilot is no PX4 (MAV_AUTOPILOT {self.autopilot_kind})")
+        if self.vehicle_type not in wire.MULTICOPTERS:
+            reasons.append(f"vehicle is no multicopter (MAV_TYPE {self.vehicle_type})")
         if self.frame is None:
             reasons.append("estimator origin unknown")
         elif self.state(now) is None:

@@ -203,6 +203,26 @@ def reference_loop(out: Annotated[Path, typer.Option()]) -> None:
     run_reference_loop(out, sys.stdin.fileno())
 
 
+@app.command()
+def study(
+    name: Annotated[
+        str,
+        typer.Argument(help="example1, example2, table3, readings, pareto, faults, scale, theory, or all."),
+    ],
+    seeds: Annotated[str, typer.Option(help="As in 0..19 or 0,3,5 (all: 20..39 unless said otherwise).")] = "",
+    out: Annotated[Path, typer.Option(help="Folder for tables, figures and the report.")] = Path("studies"),
+    jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
+    setup: Annotated[Path | None, typer.Option(help="Your own copy of the study's TOML file.")] = None,
+) -> None:
+    """Reproduce the paper's results and compare ours: tables, figures, a report. Finished seeds are not run again.
+
+    Needs the extra: pip install 'starling-fleet[study]'.
+    """
+    from sim.study.cli import study as run
+
+    run(name, seeds, out, jobs, setup)
+
+
 # -- the operator's verbs --------------------------------------------------------------------------------------------
 
 

@@ -26,6 +26,7 @@ from sim.dynamics import (
 from sim.px4.commander import HOME_SET_NS, Commander, Result
 from sim.px4.commands import CommandRequest, answer, set_mode
 from sim.px4.estimator import Estimator
+from sim.px4.events import EventReporter
 from sim.px4.faults import LASTING, Fault, FaultKind
 from sim.px4.link import COMPONENT_ID, Link, StreamSchedule
 from sim.px4.modes import Mode
@@ -144,6 +145,7 @@ class Autopilot:
         self.link = Link(self.telemetry.system_id)
         self.schedule = StreamSchedule(self.link, self.telemetry)
         self._services = Services(self.link, self.parameters, self._apply_parameters)
+        self._events = EventReporter(self.link, self.commander)
         self._stream = SetpointStream()
         self._flown_mode = self.commander.mode
         self._origin_announced = False
@@ -272,6 +274,7 @@ class Autopilot:
             self._estimator.step(now)
         self._drain_battery()
         self.commander.step(now, wants_takeoff=self._wants_takeoff)
+        self._events.step()
         if self._fault_ends_ns:
             self._end_faults(now)
         if not self._home_set and now >= HOME_SET_NS:
@@ -314,8 +317,7 @@ class Autopilot:
 
     def _setpoint(self, mode: Mode) -> Setpoint:
         if mode is Mode.OFFBOARD:
-            setpoint = self._stream.setpoint
-            return HOLD_STILL if setpoint is None or not setpoint.is_flyable() else setpoint
+            return self._stream.setpoint
         commander, vehicle = self.commander, self.vehicle
         if mode.is_manual and commander.pilot_present:
             return HOLD_STILL
@@ -467,7 +469,7 @@ class Autopilot:
         if commander.mode is Mode.OFFBOARD:
             if self._flown_mode is not Mode.OFFBOARD:
                 self._enter(Mode.OFFBOARD)
-            stream.setpoint = setpoint
+            stream.setpoint = setpoint if setpoint.is_flyable() else HOLD_STILL
 
     def _take_command(self, message: Any) -> None:
         if isinstance(message, mavlink.MAVLink_command_int_message):

@@ -76,7 +76,7 @@ switching_threshold = compiled(trigger.switching_threshold)
 switching_exceeds = compiled(trigger.switching_exceeds, switching_threshold=switching_threshold)
 alpha_beta = compiled(estimate.alpha_beta)
 barrier = compiled(safety.barrier)
-project = compiled(safety.project)
+project: Callable[[float, float, Floats, Floats], tuple[float, float, bool]] = compiled(cast(Any, safety.project))
 sidestep = compiled(safety.sidestep)
 is_outlier = compiled(neighbours.is_outlier)
 saturated = compiled(consensus.saturated)
@@ -145,6 +145,11 @@ class Options(NamedTuple):
     impulse: float
     impulse_probability: float
     lag: float
+    push_agent: int
+    push_step: int
+    push_x: float
+    push_y: float
+    push_z: float
     relative_sigma: float
     """classic trigger: gamma_1; elastic: observer threshold coefficient"""
     relative_a: float
@@ -395,7 +400,7 @@ def fires(i: int, k: int, s: State, o: Options, et: ErrorTrigger, st: SwitchingT
         s.counts[2 if math.sqrt(ep) + math.sqrt(ev) > st.eta else 3] += 1
         return switching_exceeds(ep, ev, t, st)
     if kind == PERIODIC:
-        steps = max(int(round(o.period / o.dt)), 1)
+        steps = max(round(o.period / o.dt), 1)
         return k % steps == 0
     if kind == FLOAT_CLOCK:
         if t - s.clock[i] >= o.period:
@@ -573,7 +578,7 @@ def predict_all(k: int, s: State, ref: Floats, o: Options, ig: IntentGains) -> N
 
 
 @kernel
-def _gates(i: int, s: State, ref: Floats, k: int, o: Options) -> tuple[float, float]:
+def _gates(i: int, s: State, o: Options) -> tuple[float, float]:
     """Median residual over the neighbours of i that take part."""
     count = 0
     for e in range(s.start[i], s.start[i + 1]):
@@ -606,7 +611,7 @@ def command(k: int, s: State, ref: Floats, o: Options, g: Gains, ig: IntentGains
         qx, qy, qz = 0.0, 0.0, 0.0
         own = s.own[i] if o.own_held == 1 else s.measured[i]
         gated = t >= o.gates_after
-        mx, my = _gates(i, s, ref, k, o) if gated else (0.0, 0.0)
+        mx, my = _gates(i, s, o) if gated else (0.0, 0.0)
         planes = 0
         blocked = -1
         deficit = 0.0
@@ -757,6 +762,10 @@ def move(k: int, s: State, o: Options) -> None:
     drive = o.gust * math.sqrt(1.0 - keep * keep)
     keep_p = math.exp(-dt / o.sigma_p_time)
     drive_p = o.sigma_p * math.sqrt(1.0 - keep_p * keep_p)
+    if k == o.push_step:
+        s.v[o.push_agent, 0] += o.push_x
+        s.v[o.push_agent, 1] += o.push_y
+        s.v[o.push_agent, 2] += o.push_z
     for i in range(s.x.shape[0]):
         d0, d1, d2 = 0.0, 0.0, 0.0
         if o.gust > 0.0:
@@ -859,7 +868,8 @@ def law_fast(
     x: Floats, v: Floats, rows: Floats, slot: Floats, start: Ints, column: Ints, range2: float,
     vd: Floats, g: Gains, u: Floats, residual: Floats,
 ) -> None:  # fmt: skip
-    """The flown law alone for large swarms: shared predictions (rows p^, v^, slot), one common plan, select not branch."""
+    """The flown law alone for large swarms: shared predictions (rows p^, v^, slot), one common plan, select
+    instead of branch."""
     for i in range(x.shape[0]):
         n = 0.0
         s0, s1, s2 = 0.0, 0.0, 0.0

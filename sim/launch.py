@@ -78,11 +78,13 @@ class FleetProcesses:
     children: dict[str, _Child] = field(default_factory=dict)
 
     def start(self, name: str, *arguments: str) -> subprocess.Popen[bytes]:
-        """Start `python -m ...` with its output in NAME.log."""
+        """Start a command of a package with its output in NAME.log; -P: the user's folder holds no modules for it."""
         log = self.stack.enter_context((self.folder / f"{name}.log").open("wb"))
+        # SITL instances take longer to end than a watched process may.
+        watched = () if "sitl" in arguments else ("sim.child",)
         process = subprocess.Popen(
-            [sys.executable, "-m", *arguments], stdin=subprocess.PIPE, stdout=log, stderr=subprocess.STDOUT,
-            start_new_session=True,
+            [sys.executable, "-P", "-m", *watched, *arguments], stdin=subprocess.PIPE, stdout=log,
+            stderr=subprocess.STDOUT, start_new_session=True,
         )  # fmt: skip
         self.children[name] = _Child(name, process, log)
         return process
@@ -200,6 +202,7 @@ def _fly(
         truth=np.fromfile(truth, TRUTH_DTYPE) if truth.exists() else np.zeros(0, TRUTH_DTYPE),
         takeoff_ns=takeoff_ns,
         lost=lost,
+        disarmed={i: not said["armed"] for i, said in final.items()},
         versions={"python": sys.version.split()[0], **{name: version(name) for name in LIBRARIES}},
     )
     for i in ids:

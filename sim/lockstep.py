@@ -65,6 +65,11 @@ class Lockstep:
     _net: Network = field(init=False)
     _queue: list[tuple[int, int, Callable[[], None]]] = field(default_factory=list)
     _count: int = 0
+    _autopilot_due_ns: dict[int, int] = field(default_factory=dict)
+    _agent_due_ns: dict[int, int] = field(default_factory=dict)
+    """deadlines, kept until something reaches the vehicle: asking all of them at each step would cost most of the time"""
+    _touched: set[int] = field(default_factory=set)
+    """vehicles whose deadlines may have changed"""
 
     def __post_init__(self) -> None:
         self._net = Network(self.network, self.seed)
@@ -94,6 +99,7 @@ class Lockstep:
                 self._at(self.now_ns + PRESENCE_DELAY_NS, lambda j=j: self._presence(j, i, alive))  # type: ignore[misc]
 
     def _presence(self, receiver: int, about: int, alive: bool) -> None:
+        self._touched.add(receiver)
         if self.vehicles[receiver].alive:
             self._log(receiver, "input/presence", bytes((about, alive)))
             self.vehicles[receiver].agent.receive_presence(about, alive, self.now)
@@ -108,37 +114,52 @@ class Lockstep:
         """Let time pass until `time_s` from the start, or until `stop()` (asked ten times a second) is true."""
         end_ns = round(time_s * 1e9)
         next_check_ns = self.now_ns
+        self._touched.update(self.vehicles)
         while True:
             if stop is not None and self.now_ns >= next_check_ns:
                 if stop():
                     return
                 next_check_ns = self.now_ns + 100_000_000
-            time_ns = self._queue[0][0]
-            for v in self.vehicles.values():
-                time_ns = min(time_ns, v.autopilot.next_deadline_ns())
-                if v.alive:
-                    time_ns = min(time_ns, v.agent.next_deadline_ns())
+                self._touched.update(self.vehicles)
+            self._ask_deadlines()
+            time_ns = min(
+                self._queue[0][0], min(self._autopilot_due_ns.values()), min(self._agent_due_ns.values(), default=end_ns)
+            )
             if time_ns > end_ns:
                 self.now_ns = end_ns
                 return
             self.now_ns = max(time_ns, self.now_ns)
             self._step()
 
+    def _ask_deadlines(self) -> None:
+        for i in self._touched:
+            v = self.vehicles[i]
+            self._autopilot_due_ns[i] = v.autopilot.next_deadline_ns()
+            if v.alive:
+                self._agent_due_ns[i] = v.agent.next_deadline_ns()
+            else:
+                self._agent_due_ns.pop(i, None)
+        self._touched.clear()
+
     def _step(self) -> None:
         now_ns = self.now_ns
         while self._queue and self._queue[0][0] <= now_ns:
             heapq.heappop(self._queue)[2]()
+        self._ask_deadlines()
         for i, v in self.vehicles.items():
-            if v.autopilot.next_deadline_ns() <= now_ns:
+            if self._autopilot_due_ns[i] <= now_ns:
+                self._touched.add(i)
                 datagrams = v.autopilot.advance(now_ns)
                 if datagrams and v.alive:
                     self._at(now_ns + LINK_DELAY_NS, lambda i=i, d=datagrams: self._to_companion(i, d))  # type: ignore[misc]
         for i, v in self.vehicles.items():
-            if v.alive and v.agent.next_deadline_ns() <= now_ns:
+            if v.alive and self._agent_due_ns[i] <= now_ns:
+                self._touched.add(i)
                 self._advance(i)
 
     def _to_companion(self, i: int, datagrams: Iterable[bytes]) -> None:
         v = self.vehicles[i]
+        self._touched.add(i)
         if not v.alive:
             return
         for datagram in datagrams:
@@ -146,6 +167,7 @@ class Lockstep:
             v.agent.receive_mavlink(datagram, self.now)
 
     def _to_autopilot(self, i: int, datagrams: Iterable[bytes]) -> None:
+        self._touched.add(i)
         for datagram in datagrams:
             self.vehicles[i].autopilot.receive(datagram, self.now_ns)
 
@@ -169,6 +191,7 @@ class Lockstep:
 
     def _to_peer(self, j: int, key: str, payload: bytes) -> None:
         v = self.vehicles[j]
+        self._touched.add(j)
         if v.alive:
             self._log(j, "input/peer", key.encode() + b"\0" + payload)
             v.agent.receive_peer(key, payload, self.now)

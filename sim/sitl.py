@@ -7,12 +7,12 @@ HIL_STATE_QUATERNION on 19410 + i, the state of arming and mode from the ground 
 
 import os
 import select
-import shutil
 import signal
 import socket
 import subprocess
+import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from math import hypot
@@ -24,8 +24,9 @@ import numpy as np
 from companion.config import FleetConfig, Vehicle, autopilot_port, companion_port
 from companion.core.frames import Geodetic, Ned, geodetic_to_ned, ned_to_geodetic
 from companion.errors import CompanionError
+from companion.io.link import SO_TIMESTAMPNS, received_unix_ns
 from companion.wire.mavlink import dialect as mavlink
-from companion.wire.mavlink import parameter_value
+from companion.wire.mavlink import interval_parameters, parameter_value
 from sim.stubs import TRUTH_DTYPE
 
 GCS_PORT = 14550
@@ -36,6 +37,13 @@ PX4_PORTS = 10
 STARTUP_TIMEOUT_S = 30.0
 END_TIMEOUT_S = 6.0
 FLUSH_INTERVAL_NS = 500_000_000
+RECEIVE_BUFFER_BYTES = 1 << 20
+CURRENT_MODE = 436
+STATE_MESSAGES = frozenset({0, 22, 30, 77, 245, CURRENT_MODE})
+"""HEARTBEAT, PARAM_VALUE, ATTITUDE, COMMAND_ACK, EXTENDED_SYS_STATE and CURRENT_MODE"""
+TRUTH_MESSAGES = frozenset({115})
+"""HIL_STATE_QUATERNION"""
+MODE_RATE_HZ = 20.0
 SIH_QUADROTOR = 10040
 FLEET_PARAMETERS: Mapping[str, float | int] = {
     "COM_OBL_RC_ACT": 4,
@@ -61,6 +69,7 @@ class SitlSettings:
     stop_fd: int
     parameters: Mapping[str, float | int]
     """beyond FLEET_PARAMETERS"""
+    log: Callable[[str], None] = print
 
 
 def check_build(build: Path) -> Path:
@@ -73,8 +82,77 @@ def check_build(build: Path) -> Path:
     return build.resolve()
 
 
+class Px4Instance:
+    """One running PX4 process. Instance i has system id i + 1 and links as PX4's scripts open them.
+
+    It gets SIGTERM when whoever started it dies, however that may be.
+    """
+
+    def __init__(self, index: int, home: Geodetic, build: Path, folder: Path, parameters: Mapping[str, float | int]):
+        folder = folder.resolve()  # PX4 changes its folder before it reads this
+        folder.mkdir(parents=True)
+        environment = {
+            **{k: v for k, v in os.environ.items() if not k.startswith("PX4_")},
+            "PX4_SIM_MODEL": "sihsim_quadx",
+            "PX4_SYS_AUTOSTART": str(SIH_QUADROTOR),
+            "PX4_HOME_LAT": f"{home.latitude_deg:.9f}",
+            "PX4_HOME_LON": f"{home.longitude_deg:.9f}",
+            "PX4_HOME_ALT": f"{home.altitude_amsl_m:.3f}",
+            **{f"PX4_PARAM_{name}": str(value) for name, value in parameters.items()},
+        }
+        self.index = index
+        self.system_id = index + 1
+        self.parameters = parameters
+        self.build = build
+        with (folder / "px4.log").open("wb") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, "-I", "-S", "-c", _END_WITH_PARENT, str(build / "bin" / "px4"), "-i", str(index),
+                 "-d", str(build / "etc"), "-w", str(folder)],
+                cwd=folder, env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )  # fmt: skip
+
+    def open_offboard_link(self) -> None:
+        """Past ten instances: a link of its own, since PX4's scripts would send all to one port."""
+        command = (
+            "start", "-x", "-u", str(autopilot_port(self.index)), "-r", "4000000", "-f", "-m", "onboard",
+            "-o", str(companion_port(self.index)),
+        )  # fmt: skip
+        done = subprocess.run(
+            [str(self.build / "bin" / "px4-mavlink"), "--instance", str(self.index), *command],
+            check=False, capture_output=True, text=True, timeout=10,
+        )  # fmt: skip
+        if done.returncode != 0:
+            said = f"{done.stdout}{done.stderr}".strip()
+            raise CompanionError(f"PX4 instance {self.index} opens no link on {autopilot_port(self.index)}: {said}")
+
+    def ask_to_end(self) -> None:
+        """SIGTERM, from which PX4 ends in about two seconds."""
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGTERM)
+
+    def end(self) -> None:
+        """End it, with SIGKILL if need be, and wait until it is gone."""
+        self.ask_to_end()
+        try:
+            self.process.wait(END_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+        Path(f"/tmp/px4-sock-{self.index}").unlink(missing_ok=True)
+
+
+_END_WITH_PARENT = f"""
+import ctypes, os, sys
+ctypes.CDLL(None).prctl(1, {int(signal.SIGTERM)})
+os.execv(sys.argv[1], sys.argv[1:])
+"""
+"""PR_SET_PDEATHSIG lasts through exec; set in an interpreter of its own, since forking a process with threads to run
+Python in it may hang"""
+
+
 class _Instance:
-    """One PX4 process with its truth socket."""
+    """One vehicle's PX4 with its truth socket, and what it has said."""
 
     def __init__(self, config: FleetConfig, vehicle: Vehicle, settings: SitlSettings) -> None:
         self.vehicle = vehicle
@@ -86,49 +164,36 @@ class _Instance:
             )
         self.truth_socket = _bind(TRUTH_PORT + self.index, f"vehicle {vehicle.id}'s truth")
         home = ned_to_geodetic(Ned(vehicle.pad_north_m, vehicle.pad_east_m, 0.0), config.origin)
-        folder = settings.folder.resolve() / f"px4-{vehicle.id}"  # PX4 changes its folder before it reads this
-        folder.mkdir(parents=True)
-        parameters = {**FLEET_PARAMETERS, **settings.parameters}
-        environment = {
-            **{k: v for k, v in os.environ.items() if not k.startswith("PX4_")},
-            "PX4_SIM_MODEL": "sihsim_quadx",
-            "PX4_SYS_AUTOSTART": str(SIH_QUADROTOR),
-            "PX4_HOME_LAT": f"{home.latitude_deg:.9f}",
-            "PX4_HOME_LON": f"{home.longitude_deg:.9f}",
-            "PX4_HOME_ALT": f"{home.altitude_amsl_m:.3f}",
-            **{f"PX4_PARAM_{name}": str(value) for name, value in parameters.items()},
-        }
-        self.parameters = parameters
-        self.build = settings.build
-        with (folder / "px4.log").open("wb") as log:
-            self.process = subprocess.Popen(
-                [str(settings.build / "bin" / "px4"), "-i", str(self.index), "-d", str(settings.build / "etc"), "-w",
-                 str(folder)],
-                cwd=folder, env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT,
-                start_new_session=True,
-            )  # fmt: skip
+        self.parameters = {**FLEET_PARAMETERS, **settings.parameters}
+        try:
+            self.px4 = Px4Instance(
+                self.index, home, settings.build, settings.folder / f"px4-{vehicle.id}", self.parameters
+            )
+        except BaseException:
+            self.truth_socket.close()
+            raise
         self.armed = False
         self.custom_mode = 0
         self.landed_state = 1
         self.checked: dict[str, float | int] = {}
+        self.clock: list[tuple[float, float]] = []
+        """(UTC s, the simulation's s), first and latest"""
+        self.mode_streamed = False
+        self.missed = False
+        """whether its early end has been told"""
 
-    def open_offboard_link(self) -> None:
-        """Past ten instances: a link of its own, since PX4's scripts would send all to one port."""
-        subprocess.run(
-            [str(self.build / "bin" / "px4-mavlink"), "--instance", str(self.index), "start", "-x", "-u",
-             str(autopilot_port(self.index)), "-r", "4000000", "-f", "-m", "onboard", "-o",
-             str(companion_port(self.index))],
-            check=True, capture_output=True, timeout=10,
-        )  # fmt: skip
-
-    def end(self) -> None:
-        """SIGTERM, then SIGKILL."""
-        if self.process.poll() is None:
-            self.process.send_signal(signal.SIGTERM)
+    def ran_at(self) -> float | None:
+        """Simulated per real time so far."""
+        if len(self.clock) < 2:
+            return None
+        (real0, sim0), (real1, sim1) = self.clock
+        return (sim1 - sim0) / max(real1 - real0, 1e-9)
 
 
 def _bind(port: int, whose: str) -> socket.socket:
     s = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    s.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+    s.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
     try:
         s.bind(("127.0.0.1", port))
     except OSError as error:
@@ -156,21 +221,12 @@ class SitlHost:
             for vehicle in config.vehicles:
                 instance = _Instance(config, vehicle, settings)
                 self._stack.callback(instance.truth_socket.close)
-                self._stack.callback(self._finish, instance)
+                self._stack.callback(instance.px4.end)
                 self.instances.append(instance)
         except BaseException:
             self._stack.close()
             raise
         self._by_system = {i.vehicle.system_id: i for i in self.instances}
-
-    def _finish(self, instance: _Instance) -> None:
-        instance.end()
-        try:
-            instance.process.wait(END_TIMEOUT_S)
-        except subprocess.TimeoutExpired:
-            instance.process.kill()
-            instance.process.wait()
-        shutil.rmtree(f"/tmp/px4-sock-{instance.index}", ignore_errors=True)
 
     def run(self, grace_s: float) -> None:
         """Serve until the launcher is gone or says so; then leave the vehicles `grace_s` for their landing commands."""
@@ -178,10 +234,11 @@ class SitlHost:
         for s in (signal.SIGTERM, signal.SIGINT):
             signal.signal(s, lambda *_: ended.append(True))
         with self._stack:
-            self._read_back_parameters()
+            if not self._read_back_parameters(ended):
+                return
             for instance in self.instances:
                 if instance.index >= PX4_PORTS:
-                    instance.open_offboard_link()
+                    instance.px4.open_offboard_link()
             until: float | None = None
             stop_fds = [self.settings.stop_fd]
             while until is None or time.monotonic() < until:
@@ -189,8 +246,19 @@ class SitlHost:
                     ended.clear()
                     stop_fds = []
                     until = time.monotonic() + (grace_s if until is None else 0.0)
+                self._tell_missing()
             for instance in self.instances:
-                instance.end()
+                instance.px4.ask_to_end()
+                factor = instance.ran_at()
+                if factor is not None:
+                    self.settings.log(f"vehicle {instance.vehicle.id}: simulated at {factor:.3f} of real time")
+
+    def _tell_missing(self) -> None:
+        """An instance that has ended in flight is told once; the others fly on."""
+        for instance in self.instances:
+            if not instance.missed and (status := instance.px4.process.poll()) is not None:
+                instance.missed = True
+                self.settings.log(f"vehicle {instance.vehicle.id}: PX4 ended with status {status}; see its px4.log")
 
     def _serve(self, timeout_s: float, stop_fds: Sequence[int]) -> bool:
         sockets: list[Any] = [self._gcs, *(i.truth_socket for i in self.instances)]
@@ -202,28 +270,38 @@ class SitlHost:
                 self._read_truth(instance)
         return any(fd in ready and not os.read(fd, 4096) for fd in stop_fds)
 
-    def _messages(self, s: socket.socket) -> list[Any]:
-        found: list[Any] = []
+    def _messages(self, s: socket.socket, wanted: frozenset[int]) -> Iterator[tuple[int, Any]]:
+        """What waits of those kinds, with the time at which the kernel got it (UTC, ns): this process may be late.
+
+        The others, most of the traffic, are told by their heads at a hundredth of a decoding's cost.
+        """
         while True:
             try:
-                data = s.recv(2048)
+                data, ancillary, _, _ = s.recvmsg(2048, 64)
             except BlockingIOError:
-                return found
+                return
             except ConnectionError:
                 continue
-            found += self._mav.parse_buffer(data) or []
+            if len(data) > 9 and data[7] | data[8] << 8 | data[9] << 16 in wanted:
+                for message in self._mav.parse_buffer(data) or []:
+                    yield received_unix_ns(ancillary), message
 
     def _read_states(self) -> None:
-        for message in self._messages(self._gcs):
+        for time_unix_ns, message in self._messages(self._gcs, STATE_MESSAGES):
             instance = self._by_system.get(message.get_srcSystem())
             if instance is None or message.get_srcComponent() != 1:
                 continue
             match message:
                 case mavlink.MAVLink_heartbeat_message():
                     instance.armed = bool(message.base_mode & 128)
-                    instance.custom_mode = message.custom_mode
+                    if not instance.mode_streamed:
+                        instance.custom_mode = message.custom_mode
                 case mavlink.MAVLink_current_mode_message():
                     instance.custom_mode = message.custom_mode
+                case mavlink.MAVLink_command_ack_message():
+                    instance.mode_streamed |= message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
+                case mavlink.MAVLink_attitude_message():
+                    instance.clock[1:] = [(time_unix_ns * 1e-9, message.time_boot_ms * 1e-3)]
                 case mavlink.MAVLink_extended_sys_state_message():
                     instance.landed_state = message.landed_state
                 case mavlink.MAVLink_param_value_message():
@@ -231,11 +309,11 @@ class SitlHost:
 
     def _read_truth(self, instance: _Instance) -> None:
         rows = []
-        for message in self._messages(instance.truth_socket):
+        for time_unix_ns, message in self._messages(instance.truth_socket, TRUTH_MESSAGES):
             if isinstance(message, mavlink.MAVLink_hil_state_quaternion_message):
                 point = Geodetic(message.lat * 1e-7, message.lon * 1e-7, message.alt * 1e-3)
                 row = np.zeros((), TRUTH_DTYPE)
-                row["time_unix_ns"] = time.time_ns()
+                row["time_unix_ns"] = time_unix_ns
                 row["vehicle_id"] = instance.vehicle.id
                 row["armed"], row["landed_state"] = instance.armed, instance.landed_state
                 row["custom_mode"] = instance.custom_mode
@@ -250,27 +328,36 @@ class SitlHost:
             self._flushed_ns = now_ns
             self._file.flush()
 
-    def _read_back_parameters(self) -> None:
-        """Every parameter set at the start must have arrived; CompanionError names vehicle and parameter if not."""
+    def _read_back_parameters(self, ended: Sequence[bool]) -> bool:
+        """Wait until every parameter set at the start has arrived, and for CURRENT_MODE at a rate worth recording.
+
+        False when ended meanwhile; CompanionError names vehicle and parameter that did not arrive.
+        """
         deadline = time.monotonic() + STARTUP_TIMEOUT_S
+        command, *interval = interval_parameters(CURRENT_MODE, MODE_RATE_HZ)
         while time.monotonic() < deadline:
-            missing = {i.vehicle.id: _missing(i) for i in self.instances}
-            if not any(missing.values()):
-                return
-            for instance in self.instances:
-                if instance.process.poll() is not None:
+            waiting = [i for i in self.instances if _missing(i) or not i.mode_streamed]
+            if not waiting:
+                return True
+            for instance in waiting:
+                if instance.px4.process.poll() is not None:
                     raise CompanionError(f"vehicle {instance.vehicle.id}: PX4 ended at its start; see its px4.log")
+                system_id = instance.vehicle.system_id
+                if not instance.mode_streamed:
+                    self._ask(instance, mavlink.MAVLink_command_long_message(
+                        system_id, 1, command, 0, *interval, 0.0, 0.0, 0.0, 0.0, 0.0
+                    ))  # fmt: skip
                 for name in _missing(instance):
-                    request = mavlink.MAVLink_param_request_read_message(
-                        instance.vehicle.system_id, 1, name.encode(), -1
-                    )
-                    address = ("127.0.0.1", GCS_PORT_OF_INSTANCE + instance.index)
-                    self._gcs.sendto(request.pack(self._mav), address)
+                    self._ask(instance, mavlink.MAVLink_param_request_read_message(system_id, 1, name.encode(), -1))
             until = time.monotonic() + 0.5
             while time.monotonic() < until:
-                if self._serve(0.1, [self.settings.stop_fd]):
-                    return
-        raise CompanionError(f"PX4 parameters not as set after {STARTUP_TIMEOUT_S:.0f} s: {missing}")
+                if self._serve(0.1, [self.settings.stop_fd]) or ended:
+                    return False
+        missing = {i.vehicle.id: _missing(i) for i in self.instances if _missing(i)}
+        raise CompanionError(f"PX4 parameters not as set after {STARTUP_TIMEOUT_S:.0f} s: {missing or 'silent'}")
+
+    def _ask(self, instance: _Instance, message: Any) -> None:
+        self._gcs.sendto(message.pack(self._mav), ("127.0.0.1", GCS_PORT_OF_INSTANCE + instance.index))
 
 
 def _missing(instance: _Instance) -> dict[str, float | int | None]:
@@ -282,4 +369,4 @@ def _missing(instance: _Instance) -> dict[str, float | int | None]:
     }
 
 
-__all__ = ["SitlHost", "SitlSettings", "check_build"]
+__all__ = ["FLEET_PARAMETERS", "Px4Instance", "SitlHost", "SitlSettings", "check_build"]

@@ -5,10 +5,12 @@ elsewhere (measured: a client on any other port gets nothing).
 """
 
 import errno
+import math
 import os
 import selectors
 import signal
 import socket
+import struct
 import threading
 import time
 from collections.abc import Iterator
@@ -39,6 +41,8 @@ TRUTH_DTYPE = np.dtype(
 """one record of the truth file: UTC, the vehicle, MAV_LANDED_STATE, PX4's custom_mode, true motion in the fleet frame,
 longest time without a set-point while OFFBOARD flew. The file is these records and nothing else: np.fromfile reads it.
 """
+_TRUTH_RECORD = struct.Struct("<qHBBI3d3fff")
+"""the same record, packed one at a time: some ten times faster than numpy on single rows"""
 TRUTH_INTERVAL_NS = 20_000_000
 FLUSH_INTERVAL_NS = 500_000_000
 RECEIVE_BUFFER_BYTES = 1 << 20
@@ -95,21 +99,25 @@ class _TruthRecorder:
         self._flushed_ns = 0
 
     def write(self, vehicles: list[tuple[int, Autopilot]], utc_offset_ns: int, now_ns: int) -> None:
-        rows = np.zeros(len(vehicles), TRUTH_DTYPE)
-        for row, (vehicle_id, autopilot) in zip(rows, vehicles, strict=True):
+        records = []
+        for vehicle_id, autopilot in vehicles:
             state = autopilot.truth()
-            row["time_unix_ns"] = state.time_ns + utc_offset_ns
-            row["vehicle_id"] = vehicle_id
-            row["armed"] = state.armed
-            row["landed_state"] = state.landed_state
-            row["custom_mode"] = state.custom_mode
-            row["position_ned_m"] = state.position_ned_m
-            row["velocity_ned_m_s"] = state.velocity_ned_m_s
-            row["setpoint_gap_max_s"] = state.setpoint_gap_max_s
-            row["attitude_rate_rad_s"] = np.nan
+            records.append(
+                _TRUTH_RECORD.pack(
+                    state.time_ns + utc_offset_ns,
+                    vehicle_id,
+                    state.armed,
+                    state.landed_state,
+                    state.custom_mode,
+                    *state.position_ned_m,
+                    *state.velocity_ned_m_s,
+                    state.setpoint_gap_max_s,
+                    math.nan,  # a point mass has no attitude rate to speak of
+                )
+            )
         # A full disk ends the record, not the flight.
         with suppress(OSError):
-            self._file.write(rows.tobytes())
+            self._file.write(b"".join(records))
             if now_ns - self._flushed_ns >= FLUSH_INTERVAL_NS:
                 self._flushed_ns = now_ns
                 self._file.flush()
@@ -223,8 +231,8 @@ def run_stubs(settings: StubFleetSettings) -> None:
             selector.register(signal_fd, selectors.EVENT_READ, None)
             if settings.stop_fd is not None:
                 selector.register(settings.stop_fd, selectors.EVENT_READ, None)
-            for link in links:
-                selector.register(link.socket, selectors.EVENT_READ, link)
+            for index, link in enumerate(links):
+                selector.register(link.socket, selectors.EVENT_READ, index)
             _serve(settings, links, selector, recorder, boot_ns, utc_offset_ns)
     finally:
         for link in links:
@@ -254,7 +262,8 @@ def _serve(
             wake_ns = min(wake_ns, end_ns)
         for key, _ in selector.select(max(wake_ns - now_ns, 0) / 1e9):
             if key.data is not None:
-                key.data.receive_all()
+                links[key.data].receive_all()
+                deadlines[key.data] = links[key.data].autopilot.next_deadline_ns()
             elif _is_over(key.fd, settings.stop_fd):
                 if key.fd == settings.stop_fd:
                     selector.unregister(key.fd)
@@ -263,8 +272,7 @@ def _serve(
                 end_ns = time.monotonic_ns() + (0 if asked_again else grace_ns)
         now_ns = time.monotonic_ns()
         for index, link in enumerate(links):
-            # One vehicle's answers wait for the grid; nothing is due more often than a step.
-            if now_ns >= deadlines[index] or link.autopilot.next_deadline_ns() <= now_ns:
+            if now_ns >= deadlines[index]:
                 link.send_all(now_ns)
                 deadlines[index] = link.autopilot.next_deadline_ns()
         if now_ns >= truth_due_ns:

@@ -1,7 +1,7 @@
 """What a flight was like: one account for stubs, PX4 and lockstep, from true states and from what was sent.
 
 Errors are computed from the vehicles' true motion (the stubs' or the simulator's), not from what companions believed;
-what they believed stands beside it.
+what they believed stands beside it, and is judged where nobody knows the truth (vehicles in the field).
 """
 
 import json
@@ -29,6 +29,7 @@ SETTLING_S = 3.0
 WINDOW_S = 10.0
 ON_GROUND = 1
 REFERENCE_HZ = 20.0
+BELIEVED_STEP_NS = 100_000_000
 BELIEVED = ("formation_error_rms_m", "velocity_error_rms_m_s", "centroid_error_rms_m", "altitude_error_max_m")
 
 
@@ -49,8 +50,10 @@ class Flight:
     config: FleetConfig
     seed: int
     truth: Array
-    """TRUTH_DTYPE records"""
+    """TRUTH_DTYPE records; none where nobody knows"""
     takeoff_ns: int
+    disarmed: Mapping[int, bool] = field(default_factory=dict)
+    """vehicle -> whether its companion said so last; asked where there is no truth"""
     motions: list[Motion] = field(default_factory=list)
     puts: list[Put] = field(default_factory=list)
     notes: list[tuple[int, int, str]] = field(default_factory=list)
@@ -126,22 +129,33 @@ def summarise(flight: Flight) -> dict[str, Any]:
     times, position, velocity, mode, landed, armed, gap = _arrays(flight.truth, ids)
     formed_ns = _formed_ns(flight, staying)
     programme = flight.programme()
-    steady = _steady(flight, programme, times, mode, formed_ns, [ids.index(i) for i in staying])
     columns = [ids.index(i) for i in staying]
+    known = len(times) > 0
+    if known:
+        steady = _steady(flight, programme, times, formed_ns) & (mode[:, columns] == Px4Mode.OFFBOARD).all(axis=1)
+        seconds = float(steady.sum()) * _step_s(times)
+        window = (int(times[steady][0]), int(times[steady][-1])) if steady.any() else (0, 0)
+    else:
+        grid = _believed_times(flight, ids)
+        inside = grid[_steady(flight, programme, grid, formed_ns)]
+        steady = np.zeros(0, bool)
+        seconds = len(inside) * BELIEVED_STEP_NS * 1e-9
+        window = (int(inside[0]), int(inside[-1])) if len(inside) else (0, 0)
     figures = _errors(programme, staying, times[steady], position[steady][:, columns], velocity[steady][:, columns])
-    seconds = float(steady.sum()) * _step_s(times)
-    window = (times[steady][0], times[steady][-1]) if steady.any() else (0, 0)
     puts = [p for p in flight.puts if window[0] <= p.time_ns <= window[1] and p.vehicle_id in staying]
     rate = len(puts) / max(len(staying), 1) / seconds if seconds else None
     minimum, minimum_at_s = _minimum_distance(flight, times, position, landed)
     ticks = [t for i, t in flight.ticks.items() if len(t)]
-    believed = _believed(flight, programme, staying, window)
+    believed = _believed(flight, programme, staying, formed_ns, window)
     in_window = [t[(t[:, 0] >= window[0]) & (t[:, 0] <= window[1])] for t in ticks]
     every = np.concatenate(in_window) if in_window else np.zeros((0, 13))
     driven = every[every[:, 2] >= 0.0] if len(every) else every
-    ended = {i: bool(armed[-1, k] == 0 and landed[-1, k] == ON_GROUND) for k, i in enumerate(ids)} if len(times) else {}
+    ended = {i: bool(armed[-1, k] == 0 and landed[-1, k] == ON_GROUND) for k, i in enumerate(ids)} if known else {}
+    if not known:
+        ended = {i: flight.disarmed.get(i, False) for i in ids}
     summary: dict[str, Any] = {
         "vehicles": len(ids),
+        "judged_by": "truth" if known else "the vehicles' own estimates",
         "formed_after_s": None if formed_ns is None else _round((formed_ns - flight.takeoff_ns) * 1e-9),
         "minimum_distance_m": minimum,
         "minimum_distance_at_s": minimum_at_s,
@@ -157,6 +171,7 @@ def summarise(flight: Flight) -> dict[str, Any]:
         "believed": {
             **{k: believed[k] for k in BELIEVED},
             "slot_error_rms_m": _round(_rms(every[:, 4])) if len(every) else None,
+            "minimum_distance_m": _believed_minimum_m(flight, ids),
             "nearest_neighbour_m": _round(float(every[:, 5].min())) if len(every) else None,
         },
         "setpoint_rate_hz": _round(_per_vehicle(float(every[:, 6].sum()), ids, seconds)) if len(every) else None,
@@ -177,20 +192,31 @@ def summarise(flight: Flight) -> dict[str, Any]:
 
 
 def _arrays(truth: Array, ids: Sequence[int]) -> tuple[Array, ...]:
-    """Truth as arrays over (time, vehicle); times at which a vehicle is missing are left out."""
-    order = np.argsort(truth["time_unix_ns"], kind="stable")
-    rows = truth[order]
-    per_vehicle = [rows[rows["vehicle_id"] == i] for i in ids]
+    """Truth as arrays over (time, vehicle), at the times of the first; where a vehicle is missing there is none."""
+    per_vehicle = [truth[truth["vehicle_id"] == i] for i in ids]
+    if not all(len(mine) > 1 for mine in per_vehicle):
+        return tuple(np.zeros((0, len(ids), *s)) for s in ((), (3,), (3,), (), (), (), ()))
+    per_vehicle = [mine[np.argsort(mine["time_unix_ns"], kind="stable")] for mine in per_vehicle]
     common = per_vehicle[0]["time_unix_ns"]
-    grids = []
-    for mine in per_vehicle:
-        if len(mine) == 0:
-            return tuple(np.zeros((0, len(ids), *s)) for s in ((), (3,), (3,), (), (), (), ()))
-        grids.append(mine[np.clip(np.searchsorted(mine["time_unix_ns"], common), 0, len(mine) - 1)])
-    table = np.stack(grids, axis=1)
+    begin, end = max(m["time_unix_ns"][0] for m in per_vehicle), min(m["time_unix_ns"][-1] for m in per_vehicle)
+    common = common[(common >= begin) & (common <= end)]
+    # Simulators tell their vehicles' states at times of their own: motion is interpolated, the rest is the latest.
+    latest = [m[np.searchsorted(m["time_unix_ns"], common, side="right") - 1] for m in per_vehicle]
+
+    def motion(name: str) -> Array:
+        return np.stack(
+            [
+                np.stack([np.interp(common, m["time_unix_ns"], m[name][:, k].astype(float)) for k in range(3)], axis=1)
+                for m in per_vehicle
+            ],
+            axis=1,
+        )
+
     return (
-        common, table["position_ned_m"], table["velocity_ned_m_s"].astype(float), table["custom_mode"],
-        table["landed_state"], table["armed"], table["setpoint_gap_max_s"],
+        common, motion("position_ned_m"), motion("velocity_ned_m_s"),
+        *(np.stack([m[name] for m in latest], axis=1) for name in (
+            "custom_mode", "landed_state", "armed", "setpoint_gap_max_s"
+        )),
     )  # fmt: skip
 
 
@@ -203,14 +229,11 @@ def _formed_ns(flight: Flight, staying: Sequence[int]) -> int | None:
     return max(first[i] for i in staying) if staying and all(i in first for i in staying) else None
 
 
-def _steady(
-    flight: Flight, programme: Programme, times: Array, mode: Array, formed_ns: int | None, columns: Sequence[int]
-) -> npt.NDArray[np.bool_]:
-    """Where all that stayed are in OFFBOARD, formed and not changing their formation."""
+def _steady(flight: Flight, programme: Programme, times: Array, formed_ns: int | None) -> npt.NDArray[np.bool_]:
+    """Where all that stayed are formed and not changing their formation."""
     if formed_ns is None or not len(times):
         return np.zeros(len(times), bool)
-    begin = formed_ns + round(SETTLING_S * 1e9)
-    steady = (times >= begin) & (mode[:, columns] == Px4Mode.OFFBOARD).all(axis=1)
+    steady = times >= formed_ns + round(SETTLING_S * 1e9)
     landing = [t for t, i, text in flight.notes if "-> landing" in text and t > formed_ns and i not in flight.lost]
     if landing:
         steady &= times < min(landing)
@@ -255,20 +278,41 @@ def _errors(programme: Programme, ids: Sequence[int], times: Array, position: Ar
     }
 
 
-def _believed(flight: Flight, programme: Programme, ids: Sequence[int], window: tuple[int, int]) -> dict[str, Any]:
-    """The same errors as the companions' own estimates have them, ten times a second."""
-    times = np.arange(window[0], window[1], 100_000_000, dtype=np.int64)
+def _believed_times(flight: Flight, ids: Sequence[int]) -> Array:
+    """Ten times a second while every companion has ticked since the take-off."""
     rows = [flight.ticks.get(i, np.zeros((0, 13))) for i in ids]
-    if not len(times) or not all(len(r) for r in rows):
-        times = times[:0]
-        return _errors(programme, ids, times, np.zeros((0, 0, 3)), np.zeros((0, 0, 3)))
+    if not rows or not all(len(r) for r in rows):
+        return np.zeros(0, np.int64)
+    begin = max(flight.takeoff_ns, *(int(r[0, 0]) for r in rows))
+    return np.arange(begin, min(int(r[-1, 0]) for r in rows), BELIEVED_STEP_NS, dtype=np.int64)
 
-    def at(first: int) -> Array:
-        return np.stack(
-            [np.stack([np.interp(times, r[:, 0], r[:, first + k]) for k in range(3)], axis=1) for r in rows], axis=1
-        )
 
-    return _errors(programme, ids, times, at(7), at(10))
+def _believed_motion(flight: Flight, ids: Sequence[int], times: Array, first: int) -> Array:
+    """Positions (first 7) or velocities (10) as the companions have them, over (time, vehicle, axis)."""
+    if not len(times):
+        return np.zeros((0, len(ids), 3))
+    rows = [flight.ticks[i] for i in ids]
+    return np.stack(
+        [np.stack([np.interp(times, r[:, 0], r[:, first + k]) for k in range(3)], axis=1) for r in rows], axis=1
+    )
+
+
+def _believed(
+    flight: Flight, programme: Programme, ids: Sequence[int], formed_ns: int | None, window: tuple[int, int]
+) -> dict[str, Any]:
+    """The same errors as the companions' own estimates have them."""
+    times = _believed_times(flight, ids)
+    times = times[_steady(flight, programme, times, formed_ns) & (times >= window[0]) & (times <= window[1])]
+    motion = (_believed_motion(flight, ids, times, first) for first in (7, 10))
+    return _errors(programme, ids, times, *motion)
+
+
+def _believed_minimum_m(flight: Flight, ids: Sequence[int]) -> float | None:
+    """Smallest distance of any pair from the take-off on, by their own estimates."""
+    p = _believed_motion(flight, ids, _believed_times(flight, ids), 7)
+    i, j = np.triu_indices(len(ids), 1)
+    distance = np.linalg.norm(p[:, i] - p[:, j], axis=2)
+    return _round(float(distance.min())) if distance.size else None
 
 
 def _attitude_rate(truth: Array, window: tuple[int, int]) -> float | None:
@@ -338,12 +382,14 @@ def _round(value: float | None, digits: int = 4) -> float | None:
 
 def _criteria(summary: Mapping[str, Any], config: FleetConfig) -> list[dict[str, Any]]:
     """What a flight must meet to count as passed."""
-    steady = summary["steady"]
+    source = "steady" if summary["judged_by"] == "truth" else "believed"
+    distance = "minimum_distance_m" if source == "steady" else "believed.minimum_distance_m"
+    nearest = (summary if source == "steady" else summary["believed"])["minimum_distance_m"]
     spacing = config.formation.spacing_m
     rows: list[tuple[str, Any, str, float]] = [
-        ("minimum_distance_m", summary["minimum_distance_m"], ">=", 0.3 * spacing),
-        ("steady.formation_error_rms_m", steady["formation_error_rms_m"], "<=", 0.075 * spacing),
-        ("steady.centroid_error_rms_m", steady["centroid_error_rms_m"], "<=", 0.5),
+        *([(distance, nearest, ">=", 0.3 * spacing)] if len(config.vehicles) > 1 else []),
+        (f"{source}.formation_error_rms_m", summary[source]["formation_error_rms_m"], "<=", 0.075 * spacing),
+        (f"{source}.centroid_error_rms_m", summary[source]["centroid_error_rms_m"], "<=", 0.5),
         ("failsafes", len(summary["failsafes"]), "<=", 0),
         ("vehicles not landed and disarmed", sum(not x for x in summary["landed"].values()), "<=", 0),
         ("companions lost", len(summary["lost"]), "<=", 0),

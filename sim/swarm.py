@@ -191,6 +191,10 @@ class Setup:
     impulse_m_s2: float = 0.0
     impulse_probability: float = 0.0
     lag_s: float = 0.0
+    push_agent: int = 0
+    push_time_s: float = math.inf
+    push_m_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """at push_time_s this is added to one agent's velocity"""
     sigma_p_m: float = 0.0
     sigma_p_time_s: float = 2.0
     sigma_v_m_s: float = 0.0
@@ -270,7 +274,8 @@ def setup_from(values: Mapping[str, Any], where: str, base: Setup | None = None)
     formation = base.formation
     if "formation" in given:
         formation = _filled(formation, given.pop("formation"), f"{where}.formation")
-    return replace(_filled(base, given, where), formation=formation)
+    filled: Setup = _filled(base, given, where)
+    return replace(filled, formation=formation)
 
 
 def _filled(base: Any, values: Mapping[str, Any], where: str) -> Any:
@@ -429,7 +434,8 @@ def gains(setup: Setup) -> Gains:
     )  # fmt: skip
 
 
-def _options(setup: Setup) -> Any:
+def run_options(setup: Setup) -> Any:
+    """The set-up as the kernels' plain numbers."""
     slope, constant = setup.error_bound_m()
     own_held = setup.reading in ("V1", "V1b")
     elastic = setup.trigger == "elastic"
@@ -470,6 +476,11 @@ def _options(setup: Setup) -> Any:
         impulse=setup.impulse_m_s2,
         impulse_probability=setup.impulse_probability,
         lag=setup.lag_s,
+        push_agent=setup.push_agent,
+        push_step=round(setup.push_time_s / setup.dt_s) if math.isfinite(setup.push_time_s) else -1,
+        push_x=setup.push_m_s[0],
+        push_y=setup.push_m_s[1],
+        push_z=setup.push_m_s[2],
         relative_sigma=setup.elastic_sigma if elastic else setup.classic_sigma,
         relative_a=setup.elastic_rate if elastic else setup.classic_a,
         elastic_amplitude=setup.elastic_amplitude,
@@ -485,7 +496,8 @@ def _options(setup: Setup) -> Any:
 
 
 @lru_cache(maxsize=4)
-def _keys(seed: int, count: int) -> npt.NDArray[np.uint64]:
+def agent_keys(seed: int, count: int) -> npt.NDArray[np.uint64]:
+    """Each agent's own random streams, shape (count, 8)."""
     return np.stack([np.random.SeedSequence([seed, i]).generate_state(8, np.uint64) for i in range(count)])
 
 
@@ -526,6 +538,17 @@ class NeighbourList:
         self.rebuilt += 1
         return True
 
+    def sorted_order(self, x: Floats) -> Ints:
+        """Agents by cell: positions in this order keep neighbours in space close in memory."""
+        cell = np.floor((x - x.min(axis=0)) / (self.range_m / 2)).astype(np.int64)
+        return np.lexsort((cell[:, 2], cell[:, 1], cell[:, 0])).astype(np.int64)
+
+    def within_range(self, x: Floats) -> float:
+        """Mean number of neighbours within the range itself, without the skin."""
+        owner = np.repeat(np.arange(len(x)), np.diff(self.start))
+        near = np.linalg.norm(x[owner] - x[self.column[: self.start[-1]]], axis=1) <= self.range_m
+        return float(near.sum() / len(x))
+
 
 def run(setup: Setup, seed: int, *, reference: Floats | None = None, start: tuple[Floats, Floats] | None = None) -> Run:
     """Fly one set-up under one seed. `reference`, shape (steps, 1 or N, 9), replaces the plan's table."""
@@ -538,7 +561,7 @@ def run(setup: Setup, seed: int, *, reference: Floats | None = None, start: tupl
     steps = round(setup.duration_s / setup.dt_s)
     table = reference_table(setup, steps + 1) if reference is None else reference
     x, v = starts(setup, seed) if start is None else (start[0].copy(), start[1].copy())
-    o = _options(setup)
+    o = run_options(setup)
     dense = n <= DENSE_MAX
     pairs = n * (n - 1)
     columns = np.array([j for i in range(n) for j in range(n) if j != i], dtype=np.int64) if dense else None
@@ -548,7 +571,7 @@ def run(setup: Setup, seed: int, *, reference: Floats | None = None, start: tupl
     rows = pairs if o.links else n
     slots = setup.formation.slots() if table.shape[1] == 1 else np.zeros((n, 3))
     kept = -(-steps // setup.keep_every)
-    most = n * steps if setup.trigger in ("switching", "classic", "elastic") else n * (steps // 2 + 2)
+    most = n * (steps // setup.control_every + 1)
     depth = o.delay + 1 if o.links else 1
     ring_digest = max(o.digest, 1)
     width = n if dense else int(np.diff(near.start).max()) * 2 + 64
@@ -568,7 +591,7 @@ def run(setup: Setup, seed: int, *, reference: Floats | None = None, start: tupl
         ring_digest=np.zeros((depth, n if o.links else 1, ring_digest, loops.SAMPLE)),
         ring_digest_step=np.zeros((depth, n if o.links else 1, ring_digest), dtype=np.int64),
         ring_digest_id=np.full((depth, n if o.links else 1, ring_digest), -1, dtype=np.int64),
-        outage=np.zeros(rows, dtype=np.uint8), keys=_keys(seed, n), planes=np.zeros((width, 5)),
+        outage=np.zeros(rows, dtype=np.uint8), keys=agent_keys(seed, n), planes=np.zeros((width, 5)),
         weights=np.zeros(width), scratch=np.zeros((2, width)),
         measures=np.array([1e9, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]), events=np.zeros((most, 2), dtype=np.int64),
         counts=np.zeros(5, dtype=np.int64), record=np.zeros((kept, n, 6)), record_u=np.zeros((kept, n, 3)),
@@ -600,7 +623,7 @@ def run(setup: Setup, seed: int, *, reference: Floats | None = None, start: tupl
     return Run(
         setup=setup,
         seed=seed,
-        time_s=kept_steps * setup.dt_s,
+        time_s=np.asarray(kept_steps * setup.dt_s, dtype=np.float64),
         position_m=s.record[:, :, :3],
         velocity_m_s=s.record[:, :, 3:],
         command_m_s2=s.record_u,

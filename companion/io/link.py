@@ -1,15 +1,21 @@
-"""The link to the autopilot: a UDP socket with the kernel's time of reception.
+"""The link to the autopilot: a UDP socket with the kernel's time of reception, or a serial line.
 
 MAVLink without signing says who speaks by a number that anybody may write. So the first address that has spoken as the
 own autopilot is kept until it falls silent: nobody else is listened to or answered meanwhile.
 """
 
 import errno
+import os
 import socket
 import struct
+import termios
+import time
+from typing import Protocol
 
+from companion.config import Vehicle, serial_endpoint, udp_endpoint
 from companion.errors import CompanionError
 from companion.io.clock import realtime_to_monotonic
+from companion.wire.mavlink import FrameSplitter
 
 SO_TIMESTAMPNS = 35
 """asm-generic/socket.h; Python's socket module does not name it"""
@@ -19,7 +25,57 @@ ADDRESS_LIMIT_NS = 3_000_000_000
 RECEIVE_MOST = 256
 """datagrams taken at a time, so that a flood cannot keep the loop from its setpoints"""
 
+REOPEN_INTERVAL_NS = 1_000_000_000
+SERIAL_READ_MOST = 4096
+SERIAL_UNSENT_MOST = 1024
+"""bytes that may wait for a slow line: about 15 setpoints, a third of a second of them"""
+
 Address = tuple[str, int]
+
+
+def received_unix_ns(ancillary: list[tuple[int, int, bytes]]) -> int:
+    """When the kernel got a datagram (UTC, ns), from what recvmsg tells on a socket with SO_TIMESTAMPNS."""
+    stamp = next(body for _, kind, body in ancillary if kind == SO_TIMESTAMPNS)
+    seconds, nanoseconds = _TIMESPEC.unpack(stamp[: _TIMESPEC.size])
+    return int(seconds * 1_000_000_000 + nanoseconds)
+
+
+class Link(Protocol):
+    """What the loop needs of a link."""
+
+    strangers: int
+    """datagrams from elsewhere while the autopilot's address was known"""
+    send_failures: int
+
+    def fileno(self) -> int:
+        """For select."""
+
+    def receive(self) -> list[tuple[bytes, int, Address]]:
+        """The frames waiting, with the time at which each came (monotonic ns) and where from."""
+
+    def admits(self, address: Address, received_ns: int) -> bool:
+        """Whether what came from there may be the autopilot's."""
+
+    def confirm(self, address: Address, received_ns: int) -> None:
+        """An admitted frame from there was the own autopilot's heartbeat or position."""
+
+    def send(self, datagram: bytes) -> None:
+        """Send to the autopilot."""
+
+    def close(self) -> None:
+        """Release the port."""
+
+
+def open_link(vehicle: Vehicle) -> Link:
+    """The link of a vehicle's `mavlink` URL; CompanionError names the vehicle when it cannot be opened."""
+    udp, serial = udp_endpoint(vehicle.mavlink), serial_endpoint(vehicle.mavlink)
+    try:
+        if udp is not None:
+            return UdpLink(*udp)
+        assert serial is not None  # the configuration admits no third kind
+        return SerialLink(*serial)
+    except CompanionError as error:
+        raise CompanionError(f"vehicle {vehicle.id}: {error}") from error
 
 
 class UdpLink:
@@ -55,10 +111,7 @@ class UdpLink:
                 break
             except ConnectionError:
                 continue  # the autopilot's port was closed when we last sent
-            stamp = next((body for level, kind, body in ancillary if kind == SO_TIMESTAMPNS), None)
-            assert stamp is not None
-            seconds, nanoseconds = _TIMESPEC.unpack(stamp[: _TIMESPEC.size])
-            found.append((data, realtime_to_monotonic(seconds * 1_000_000_000 + nanoseconds), address))
+            found.append((data, realtime_to_monotonic(received_unix_ns(ancillary)), address))
         return found
 
     def admits(self, address: Address, received_ns: int) -> bool:
@@ -86,3 +139,117 @@ class UdpLink:
     def close(self) -> None:
         """Release the port."""
         self._socket.close()
+
+
+class SerialLink:
+    """A serial line, raw, eight bits and no parity. One that is pulled out is opened anew when it is there again.
+
+    Bytes carry no time of reception, so a frame's is when it was read; whoever is at the other end of the wire is the
+    autopilot.
+    """
+
+    def __init__(self, device: str, baud: int) -> None:
+        self.device = device
+        speed = getattr(termios, f"B{baud}", None)
+        if speed is None:
+            known = sorted(int(n[1:]) for n in dir(termios) if n[:1] == "B" and n[1:].isdigit() and n != "B0")
+            raise CompanionError(f"serial line {device}: {baud} baud is not one of {', '.join(map(str, known))}")
+        self._speed: int = speed
+        self.strangers = 0
+        self.send_failures = 0
+        """frames not sent: the line was gone, or slower than what was to be sent"""
+        self._unsent = b""
+        self._splitter = FrameSplitter()
+        self._reopen_ns = 0
+        # While the line is gone, select waits on something that never has anything to say.
+        self._nothing, self._never = os.pipe()
+        try:
+            self._fd: int | None = self._open()
+        except (OSError, termios.error) as error:
+            os.close(self._nothing)
+            os.close(self._never)
+            raise CompanionError(f"cannot open serial line {device}: {error.args[-1]}") from error
+
+    def _open(self) -> int:
+        fd = os.open(self.device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
+        try:
+            control = termios.tcgetattr(fd)[6]
+            control[termios.VMIN], control[termios.VTIME] = 1, 0
+            flags = termios.CS8 | termios.CREAD | termios.CLOCAL
+            termios.tcsetattr(fd, termios.TCSANOW, [0, 0, flags, 0, self._speed, self._speed, control])
+            termios.tcflush(fd, termios.TCIOFLUSH)
+        except termios.error:
+            os.close(fd)
+            raise
+        return fd
+
+    def fileno(self) -> int:
+        """For select."""
+        return self._nothing if self._fd is None else self._fd
+
+    def receive(self) -> list[tuple[bytes, int, Address]]:
+        """The frames that are whole by now."""
+        if self._fd is None:
+            return []
+        try:
+            data = os.read(self._fd, SERIAL_READ_MOST)
+        except BlockingIOError:
+            return []
+        except OSError:
+            data = b""
+        if not data:
+            self._lose()
+            return []
+        now_ns = time.monotonic_ns()
+        return [(frame, now_ns, (self.device, 0)) for frame in self._splitter.split(data)]
+
+    def admits(self, address: Address, received_ns: int) -> bool:  # noqa: ARG002
+        """A line has one other end."""
+        return True
+
+    def confirm(self, address: Address, received_ns: int) -> None:
+        """A line has one other end."""
+
+    def send(self, datagram: bytes) -> None:
+        """Send all of it, what is left over before the next; a frame for which there is no room is dropped whole."""
+        if self._fd is None and not self._reopened():
+            self.send_failures += 1
+            return
+        if len(self._unsent) > SERIAL_UNSENT_MOST:
+            self.send_failures += 1
+        else:
+            self._unsent += datagram
+        assert self._fd is not None
+        try:
+            self._unsent = self._unsent[os.write(self._fd, self._unsent) :]
+        except BlockingIOError:
+            return
+        except OSError:
+            self.send_failures += 1
+            self._lose()
+
+    def _lose(self) -> None:
+        if self._fd is not None:
+            os.close(self._fd)
+        self._fd = None
+        self._unsent = b""
+        self._splitter = FrameSplitter()
+        self._reopen_ns = time.monotonic_ns() + REOPEN_INTERVAL_NS
+
+    def _reopened(self) -> bool:
+        now_ns = time.monotonic_ns()
+        if now_ns < self._reopen_ns:
+            return False
+        try:
+            self._fd = self._open()
+        except (OSError, termios.error):
+            self._reopen_ns = now_ns + REOPEN_INTERVAL_NS
+            return False
+        return True
+
+    def close(self) -> None:
+        """Release the line."""
+        for fd in (self._fd, self._nothing, self._never):
+            if fd is not None:
+                os.close(fd)
+        self._fd = None

@@ -22,11 +22,11 @@ from pathlib import Path
 from typing import Any
 
 from companion.agent import Agent, Outputs
-from companion.config import FleetConfig, udp_endpoint
+from companion.config import FleetConfig
 from companion.core.values import Instant
 from companion.errors import CompanionError
 from companion.io.clock import FleetClock
-from companion.io.link import UdpLink
+from companion.io.link import open_link
 from companion.io.recorder import Recorder
 from companion.io.traffic import tcp_bytes_sent
 from companion.io.zenoh_peers import PeerMessage, PeerNetwork, PeerNetworkSettings, PresenceChange, Request
@@ -97,13 +97,7 @@ class Companion:
         self._resources.callback(self._wake_read.close)
         self._resources.callback(self._wake_write.close)
         try:
-            endpoint = udp_endpoint(self.agent.vehicle.mavlink)
-            if endpoint is None:
-                raise CompanionError(f"link {self.agent.vehicle.mavlink!r} is not supported yet; use udp://HOST:PORT")
-            try:
-                self.link = UdpLink(*endpoint)
-            except CompanionError as error:
-                raise CompanionError(f"vehicle {settings.vehicle_id}: {error}") from error
+            self.link = open_link(self.agent.vehicle)
             self._resources.callback(self.link.close)
             self.recorder: Recorder | None = None
             if settings.record is not None:

@@ -22,6 +22,8 @@ dialect = mavlink
 COMPANION_COMPONENT_ID = 191
 AUTOPILOT_COMPONENT_ID = 1
 AUTOPILOT_PX4 = 12
+MULTICOPTERS = frozenset({2, 3, 4, 13, 14, 15, 29})
+"""MAV_TYPE: quadrotor, coaxial, helicopter, hexarotor, octorotor, tricopter, dodecarotor"""
 PLAUSIBLE_MAX = 1e6
 """no position (m) or velocity (m/s) is larger than this: float32 holds far more, and squares of it overflow later"""
 SETPOINT_TYPE_MASK = 0x903
@@ -141,6 +143,52 @@ STREAMS_HZ = {32: 50.0, 436: 20.0, 245: 5.0, 230: 1.0, 1: 1.0}
 """what the companion asks for with SET_MESSAGE_INTERVAL"""
 STREAMS_OFF = (30, 31, 33, 105, 331, 111, 141, 132, 83, 85, 36, 74, 24, 87, 340)
 """what a companion's link carries by default and nobody here reads"""
+
+
+class FrameSplitter:
+    """Cuts a byte stream (a serial line) into frames, each as it would be a datagram; noise between them is dropped.
+
+    A frame counts once it is whole and another, or nothing yet, follows it; its checksum is `MavlinkLink`'s to check.
+    """
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+        self.dropped = 0
+        """bytes that belonged to no frame"""
+
+    def split(self, data: bytes) -> list[bytes]:
+        """The frames that are whole by now; what has begun waits for the next bytes."""
+        self._buffer += data
+        buffer, begin = self._buffer, 0
+        frames = []
+        while (length := _frame_length(buffer, begin)) is not None:
+            end = begin + length
+            if length == 0 or (end < len(buffer) and buffer[end] not in _FRAME_STARTS):
+                begin += 1
+                self.dropped += 1
+            elif end <= len(buffer):
+                frames.append(bytes(buffer[begin:end]))
+                begin = end
+            else:
+                break
+        del buffer[:begin]
+        return frames
+
+
+_FRAME_STARTS = (0xFD, 0xFE)
+"""MAVLink 2, and 1, which PX4 speaks on a serial line until it has heard 2"""
+
+
+def _frame_length(buffer: bytearray, begin: int) -> int | None:
+    """Length of the frame that begins there, as far as its head tells: 0 for none, None where the head is cut off."""
+    if len(buffer) - begin < 3:
+        return None
+    match buffer[begin]:
+        case 0xFD if buffer[begin + 2] < 2:
+            return 12 + buffer[begin + 1] + 13 * buffer[begin + 2]
+        case 0xFE:
+            return 8 + buffer[begin + 1]
+    return 0
 
 
 class MavlinkLink:

@@ -8,6 +8,10 @@ from sim.px4.telemetry import Telemetry
 
 NO_AID_TIMEOUT_NS = 5_000_000_000
 """the position is invalid this long after the last fix (EKF2_NOAID_TOUT)"""
+STEP_HEIGHT_M = 1.5
+"""height at which the recorded estimate stepped in its climb"""
+STEP_SIGMA_M = 0.03
+"""by about this much"""
 
 
 class Estimator:
@@ -40,6 +44,8 @@ class Estimator:
         self._drift = (0.0, 0.0)
         self._gps_lost_ns: int | None = None
         self._frozen = False
+        self._step_down = 0.0
+        self._climb_seen = False
 
     # Faults
 
@@ -100,6 +106,8 @@ class Estimator:
                 self._telemetry.commander.position_valid = False
         error_north += self._drift[0]
         error_east += self._drift[1]
+        self._step_in_climb()
+        error_down += self._step_down
         vehicle = self._vehicle
         vehicle.position_error_north_m = error_north
         vehicle.position_error_east_m = error_east
@@ -108,6 +116,16 @@ class Estimator:
         vehicle.velocity_error_east_m_s = bias_east
         vehicle.velocity_error_down_m_s = bias_down
         self._publish(now_ns)
+
+    def _step_in_climb(self) -> None:
+        """PX4's altitude estimate steps by some centimetres in a normal climb, and the reset counter with it."""
+        if not self._telemetry.commander.armed:
+            self._climb_seen = False
+        elif not self._climb_seen and self._telemetry.height_m > STEP_HEIGHT_M:
+            self._climb_seen = True
+            if self._noise.position_sigma_m > 0.0:
+                self._step_down = self._faulty.gauss(0.0, STEP_SIGMA_M)
+                self._telemetry.count_reset()
 
     def _publish(self, now_ns: int) -> None:
         vehicle, telemetry = self._vehicle, self._telemetry

@@ -2,6 +2,7 @@
 
 import math
 import os
+import struct
 from collections import deque
 from typing import Any
 
@@ -35,6 +36,17 @@ class Link:
     def send(self, message: Any) -> None:
         """Packs one message; it leaves at the next `take`, or later where the link is slow."""
         packet: bytes = message.pack(self.mav)
+        self._enqueue(packet)
+
+    def send_payload(self, message_id: int, crc_extra: int, payload: bytes) -> None:
+        """The same for a message that pymavlink does not know."""
+        payload = payload.rstrip(b"\0") or b"\0"
+        header = struct.pack("<BBBBBB", len(payload), 0, 0, self.mav.seq, self.mav.srcSystem, self.mav.srcComponent)
+        body = header + message_id.to_bytes(3, "little") + payload
+        checksum = mavlink.x25crc(body + bytes([crc_extra])).crc
+        self._enqueue(b"\xfd" + body + struct.pack("<H", checksum))
+
+    def _enqueue(self, packet: bytes) -> None:
         self.mav.seq = (self.mav.seq + 1) & 0xFF
         if self.muted:
             return

@@ -7,7 +7,7 @@ from typing import Any
 os.environ["MAVLINK20"] = "1"
 from pymavlink.dialects.v20 import development as mavlink
 
-from sim.dynamics import NAN, Setpoint
+from sim.dynamics import HOLD_STILL, NAN, Setpoint
 
 FORCE_BIT = 1 << 9
 YAW_BIT = 10
@@ -55,15 +55,15 @@ class SetpointStream:
     """Bookkeeping of the stream: the set-point that flies, how many came, the longest silence while OFFBOARD flew."""
 
     def __init__(self) -> None:
-        self.setpoint: Setpoint | None = None
-        """None until one has come since OFFBOARD was entered"""
+        self.setpoint = HOLD_STILL
+        """standing still until one has come since OFFBOARD was entered"""
         self.count = 0
         self.gap_max_ns = 0
         self._since_ns = 0
 
     def enter(self, now_ns: int) -> None:
         """OFFBOARD begins to fly: PX4 only takes set-points that come after this."""
-        self.setpoint = None
+        self.setpoint = HOLD_STILL
         self._since_ns = now_ns
 
     def watch(self, now_ns: int, last_ns: int | None) -> None:

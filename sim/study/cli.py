@@ -10,7 +10,15 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from companion.errors import CompanionError, ConfigError
 from sim.study.common import (
-    STUDIES, Config, Outcome, load_config, parse_seeds, pieces, study_module, write_outcome, writable_folder,
+    STUDIES,
+    Config,
+    Outcome,
+    load_config,
+    parse_seeds,
+    pieces,
+    study_module,
+    writable_folder,
+    write_outcome,
 )  # fmt: skip
 from sim.study.report import write_report
 from sim.swarm import kernels
@@ -55,7 +63,9 @@ def study(
             write_outcome(config, outcome, used, folder)
             done.append((config, outcome))
     report = write_report(folder, name, done, seeds=chosen)
-    console.print(f"{report}: {sum(len(o.tables) for _, o in done)} tables, {sum(len(o.figures) for _, o in done)} figures")
+    console.print(
+        f"{report}: {sum(len(o.tables) for _, o in done)} tables, {sum(len(o.figures) for _, o in done)} figures"
+    )
     return report
 
 

@@ -155,7 +155,9 @@ def writable_folder(out: Path) -> Path:
         probe.write_text("", encoding="utf-8")
         probe.unlink()
     except OSError as error:
-        raise ConfigError(f"--out {out}: nothing can be written there ({error.strerror}); name another folder") from error
+        raise ConfigError(
+            f"--out {out}: nothing can be written there ({error.strerror}); name another folder"
+        ) from error
     return out
 
 
@@ -181,9 +183,7 @@ def _piece(name: str, text: str, seed: int) -> Record:
     return dict(study_module(name).piece(config, seed))
 
 
-def pieces(
-    config: Config, seeds: Sequence[int], out: Path, jobs: int, advance: Callable[[], None]
-) -> list[Record]:
+def pieces(config: Config, seeds: Sequence[int], out: Path, jobs: int, advance: Callable[[], None]) -> list[Record]:
     """One record per seed, in order; those already finished under the same set-up and code are read back."""
     folder = out / "pieces"
     folder.mkdir(exist_ok=True)

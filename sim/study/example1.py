@@ -38,7 +38,9 @@ def finish(config: Config, pieces: Sequence[Record], seeds: Sequence[int]) -> Ou
                 "formation_rmse_m": statistics([r["formation_rmse_m"] for r in records])["mean"],
             }
         )
-    rows.append({"case": "published", **{k: published[k] for k in ("interval_mean_s", "interval_median_s", "error_start_m")}})
+    rows.append(
+        {"case": "published", **{k: published[k] for k in ("interval_mean_s", "interval_median_s", "error_start_m")}}
+    )
     outcome = Outcome()
     outcome.tables.append(
         Table(
@@ -54,9 +56,11 @@ def finish(config: Config, pieces: Sequence[Record], seeds: Sequence[int]) -> Ou
     )  # fmt: skip
     ours = rows[0]
     outcome.values["interval"] = {"reading": "V1b", **{k: ours[k] for k in ("interval_mean_s", "interval_median_s")},
-                                  "published": {k: published[k] for k in ("interval_mean_s", "interval_median_s")}}  # fmt: skip
+                                  "published": {k: published[k]
+                                                for k in ("interval_mean_s", "interval_median_s")}}  # fmt: skip
     outcome.findings += [
-        f"Under V1b the inter-event time is {ours['interval_mean_s']:.4f} s (mean) and {ours['interval_median_s']:.3f} s "
+        f"Under V1b the inter-event time is {ours['interval_mean_s']:.4f} s (mean) and "
+        f"{ours['interval_median_s']:.3f} s "
         f"(median), against {published['interval_mean_s']} and {published['interval_median_s']}: it is "
         "sqrt(delta_f)/0.8 m/s = 0.177 s, rounded up to the step, and says nothing about adaptation.",
         f"Read literally (own state true) the swarm brakes: {rows[1]['speed_15s_m_s']:.3f} m/s are left after 15 s of "
@@ -84,9 +88,15 @@ def finish(config: Config, pieces: Sequence[Record], seeds: Sequence[int]) -> Ou
     ax = axes[0, 0]
     ax.hist(gaps, bins=np.arange(0.005, 0.405, 0.01), color=BLUE)
     ax.axvline(gaps.mean(), color=GREY, label=f"mean {gaps.mean():.4f} s")
-    ax.axvline(published["interval_mean_s"], color=RED, ls="--", label=f"published mean {published['interval_mean_s']} s")
-    ax.axvline(published["interval_median_s"], color=RED, ls=":", label=f"published median {published['interval_median_s']} s")
+    ax.axvline(
+        published["interval_mean_s"], color=RED, ls="--", label=f"published mean {published['interval_mean_s']} s"
+    )
+    ax.axvline(
+        published["interval_median_s"], color=RED, ls=":", label=f"published median {published['interval_median_s']} s"
+    )
     ax.set(xlabel="time between two messages of one UAV (s)", ylabel="count", title="Example 1: inter-event times")
     ax.legend()
-    outcome.figures.append(Figure("example1_intervals", "Inter-event times with the published values (as Fig. 5).", fig))
+    outcome.figures.append(
+        Figure("example1_intervals", "Inter-event times with the published values (as Fig. 5).", fig)
+    )
     return outcome

@@ -69,8 +69,9 @@ def finish(config: Config, pieces: Sequence[Record], seeds: Sequence[int]) -> Ou
     outcome.findings += [
         "One reading gives both counts and errors in one run, nearly: all terms on last-broadcast values (V1b), phi_s "
         f"not cut at r0, and a V of two equal arms. Errors {ours['error_5s_m']:.3f}/{ours['error_10s_m']:.3f}/"
-        f"{ours['error_15s_m']:.3f} m against 0.429/0.434/0.435; UAVs 1 and 6 send {ours['count_uav_1_6']:.0f} messages "
-        f"against 150; the others {ours['count_rest_range']} against \"around 240\", which stays about a tenth above "
+        f"{ours['error_15s_m']:.3f} m against 0.429/0.434/0.435; UAVs 1 and 6 send {ours['count_uav_1_6']:.0f} "
+        "messages "
+        f'against 150; the others {ours["count_rest_range"]} against "around 240", which stays about a tenth above '
         "what this reading gives wherever the errors fit.",
         "The difference between UAVs 1 and 6 and the rest is no adaptation: UAVs with more neighbours chatter, since "
         "n k_a h > 2 for held values; the tips have fewer.",
@@ -87,12 +88,18 @@ def finish(config: Config, pieces: Sequence[Record], seeds: Sequence[int]) -> Ou
     ax = axes[0, 0]
     number = np.arange(1, 11)
     counts = np.array([p[next(iter(p))]["counts"] for p in pieces])
-    ax.bar(number, counts.mean(axis=0), yerr=counts.std(axis=0), color=BLUE, width=0.6, capsize=3, label="ours, ± 1 s.d.")
+    ax.bar(
+        number, counts.mean(axis=0), yerr=counts.std(axis=0), color=BLUE, width=0.6, capsize=3, label="ours, ± 1 s.d."
+    )
     levels = np.where(np.isin(number, (1, 6)), published["count_tips"], published["count_rest"])
     ax.scatter(number, levels, color=RED, marker="_", s=300, lw=2, label="published, about", zorder=3)
-    ax.set(xlabel="UAV", ylabel="messages in 20 s", title="Example 2: event triggers per UAV", xticks=number, ylim=(0, 290))
+    ax.set(
+        xlabel="UAV", ylabel="messages in 20 s", title="Example 2: event triggers per UAV", xticks=number, ylim=(0, 290)
+    )
     ax.legend(ncols=2, loc="upper center")
-    outcome.figures.append(Figure("example2_triggers", "Messages of each UAV, with the published levels (as Fig. 8).", fig))
+    outcome.figures.append(
+        Figure("example2_triggers", "Messages of each UAV, with the published levels (as Fig. 8).", fig)
+    )
     errors_t = per_axis_rms_m(flown)
     index = [round(t / flown.setup.dt_s) for t in TIMES_S]
     outcome.figures.append(

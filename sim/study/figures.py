@@ -43,7 +43,7 @@ def pyplot() -> Any:
     from matplotlib import pyplot as plt
 
     mpl.rcParams.update(_STYLE)
-    mpl.rcParams["axes.prop_cycle"] = mpl.cycler(color=CYCLE)
+    mpl.rcParams["axes.prop_cycle"] = plt.cycler(color=CYCLE)
     return plt
 
 

@@ -66,7 +66,9 @@ def error_curves(flown: Run, title: str) -> tuple[Any, float]:
     ax.semilogy(t, velocity, color=ORANGE, label="velocity error (m/s)")
     ax.semilogy(t, np.hypot(formation, velocity), color=GREY, lw=0.9, label="total")
     if np.isfinite(rate):
-        ax.semilogy(t[falling], formation[0] * np.exp(-rate * t[falling]), "--", color=GREEN, label=f"e^(-{rate:.2f} t)")
+        ax.semilogy(
+            t[falling], formation[0] * np.exp(-rate * t[falling]), "--", color=GREEN, label=f"e^(-{rate:.2f} t)"
+        )
     ax.set(xlabel="time (s)", ylabel="RMS per axis", title=title, ylim=(1e-4, 2))
     ax.legend(ncols=4, loc="upper right")
     return fig, rate

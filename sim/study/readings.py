@@ -78,7 +78,8 @@ def finish(config: Config, pieces: Sequence[Record], seeds: Sequence[int]) -> Ou
     delta, gamma, eta = config.base.delta_f, config.base.gamma_s2, config.base.eta
     outcome.findings += [
         f"Eq. (2) with zero-order hold brakes: 0.8 m/s become {own['V0']['speed_5s_m_s']:.2f} after 5 s and "
-        f"{own['V0']['speed_15s_m_s']:.3f} after 15 s, since held neighbours always lag and cohesion pulls back by about "
+        f"{own['V0']['speed_15s_m_s']:.3f} after 15 s, since held neighbours always lag and cohesion pulls "
+        "back by about "
         "k_c n sqrt(delta)/2.",
         f"V1b keeps its speed ({own['V1b']['speed_end_m_s']:.2f} m/s) only while every receiver holds exactly the "
         f"sender's copy: with 10 % loss {own['V1b, 10 % loss']['speed_end_m_s']:.2f}, with 50 ms of delay "
@@ -101,5 +102,7 @@ def finish(config: Config, pieces: Sequence[Record], seeds: Sequence[int]) -> Ou
     axes[0, 1].set(xlabel="time (s)", title="what is held, own state true")
     for ax in axes.flat:
         ax.legend(fontsize=7, loc="lower left" if ax is axes[0, 1] else "center right")
-    outcome.figures.append(Figure("readings_braking", "Mean speed under each reading of Eq. (2): 0.8 m/s at the start.", fig))
+    outcome.figures.append(
+        Figure("readings_braking", "Mean speed under each reading of Eq. (2): 0.8 m/s at the start.", fig)
+    )
     return outcome

@@ -2,6 +2,7 @@
 
 import base64
 import html
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,8 @@ from sim.study.common import Config, Outcome, Table, study_module
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
-h1 { font-size: 1.6rem; } h2 { margin-top: 3rem; border-bottom: 1px solid #ccc; } h3 { font-size: 1rem; margin-top: 2rem; }
+h1 { font-size: 1.6rem; }
+h2 { margin-top: 3rem; border-bottom: 1px solid #ccc; } h3 { font-size: 1rem; margin-top: 2rem; }
 table { border-collapse: collapse; font-size: 13px; display: block; overflow-x: auto; }
 th, td { padding: .25rem .6rem; border-bottom: 1px solid #e2e2e2; text-align: right; white-space: nowrap; }
 th { text-align: right; vertical-align: bottom; white-space: normal; border-bottom: 2px solid #888; }
@@ -24,10 +26,13 @@ nav a { margin-right: 1rem; }
 def write_report(out: Path, name: str, done: Sequence[tuple[Config, Outcome]], seeds: Sequence[int]) -> Path:
     """Write `report.html` for all studies, NAME.html for one; returns its path."""
     path = out / ("report.html" if name == "all" else f"{name}.html")
-    text = f"{seeds[0]}..{seeds[-1]}" if list(seeds) == list(range(seeds[0], seeds[-1] + 1)) else ",".join(map(str, seeds))
+    text = (
+        f"{seeds[0]}..{seeds[-1]}" if list(seeds) == list(range(seeds[0], seeds[-1] + 1)) else ",".join(map(str, seeds))
+    )
     body = [f"<h1>Starling formations: {'every study' if name == 'all' else html.escape(done[0][0].name)}</h1>"]
     body.append(
-        f"<p>Seeds {text}. Parameters were chosen on seeds 0..19 only; claims are judged on 20..39. Every random number "
+        f"<p>Seeds {text}. Parameters were chosen on seeds 0..19 only; claims are judged on 20..39. Every "
+        "random number "
         "comes from seed and vehicle index, so all laws meet the same disturbances.</p>"
     )
     body.append("<nav>" + "".join(f'<a href="#{c.name}">{c.name}</a>' for c, _ in done) + "</nav>")
@@ -42,7 +47,9 @@ def write_report(out: Path, name: str, done: Sequence[tuple[Config, Outcome]], s
                 f'<figure><img alt="{html.escape(figure.caption)}" src="data:image/png;base64,{data}">'
                 f"<figcaption>{html.escape(figure.caption)} <code>{command}</code></figcaption></figure>"
             )
-        body.append(f"<details><summary>Set-up: {config.name}.toml</summary><pre>{html.escape(config.text)}</pre></details>")
+        body.append(
+            f"<details><summary>Set-up: {config.name}.toml</summary><pre>{html.escape(config.text)}</pre></details>"
+        )
     path.write_text(
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{html.escape(name)}</title>'
         f"<style>{_STYLE}</style><body>{''.join(body)}</body></html>\n",
@@ -71,5 +78,5 @@ def _cell(value: Any, digits: int) -> str:
     if isinstance(value, int):
         return str(value)
     if isinstance(value, float):
-        return "–" if value != value else f"{value:.{digits}f}"
+        return "–" if math.isnan(value) else f"{value:.{digits}f}"
     return str(value)

@@ -1,4 +1,5 @@
-"""Table 3: six UAVs, four ways to communicate, and ours; absolute and about the centroid, so that standing still loses."""
+"""Table 3: six UAVs, four ways to communicate, and ours; absolute and about the centroid, so that standing
+still loses."""
 
 from collections.abc import Sequence
 
@@ -46,9 +47,11 @@ def finish(config: Config, pieces: Sequence[Record], seeds: Sequence[int]) -> Ou
              Column("formation_rmse_centred_m", "about the centroid (m)"),
              Column("velocity_rmse_m_s", "velocity RMSE against the plan (m/s)"),
              Column("velocity_consensus_rmse_m_s", "against the mean (m/s)"),
-             Column("published_velocity_rmse_m_s", "published"), Column("speed_end_m_s", "mean speed at the end (m/s)")),
+             Column("published_velocity_rmse_m_s", "published"),
+             Column("speed_end_m_s", "mean speed at the end (m/s)")),
             rows,
-            "A swarm frozen at the start has an absolute RMSE of 15/√3 = 8.66 m and few messages: read the last column.",
+            "A swarm frozen at the start has an absolute RMSE of 15/√3 = 8.66 m and few messages: read the "
+            "last column.",
         )
     )  # fmt: skip
     by = {row["method"]: row for row in rows}
@@ -60,10 +63,13 @@ def finish(config: Config, pieces: Sequence[Record], seeds: Sequence[int]) -> Ou
         f"{clock['triggers']:.0f} triggers at {clock['mean_interval_s']:.4f} s, really 17.8 Hz; a true 20 Hz sends "
         f"{true['triggers']:.0f}.",
         f"The paper's switching trigger, literally, sends {literal['triggers']:.0f} messages because the swarm stands "
-        f"still ({literal['speed_end_m_s']:.3f} m/s of 1 m/s left, RMSE {literal['formation_rmse_m']:.2f} m). With lower "
-        f"gains it sends {lower['triggers']:.0f} at {lower['mean_interval_s']:.2f} s, near the published 93 and 0.927 s, "
+        f"still ({literal['speed_end_m_s']:.3f} m/s of 1 m/s left, RMSE {literal['formation_rmse_m']:.2f} m). "
+        "With lower "
+        f"gains it sends {lower['triggers']:.0f} at {lower['mean_interval_s']:.2f} s, near the published 93 "
+        "and 0.927 s, "
         f"but then the RMSE is {lower['formation_rmse_m']:.2f} m, not 6.48: no set of gains gives the published row.",
-        f"Ours: {flown['triggers']:.0f} messages (first ones and heartbeats counted) at {flown['formation_rmse_m']:.3f} m "
+        f"Ours: {flown['triggers']:.0f} messages (first ones and heartbeats counted) at "
+        f"{flown['formation_rmse_m']:.3f} m "
         f"absolute ({flown['formation_rmse_m_min']:.3f}–{flown['formation_rmse_m_max']:.3f}); published intent "
         f"{intent['triggers']:.0f} at {intent['formation_rmse_m']:.3f} m.",
         "References [12] and [25] cannot be reproduced: [12] is a rule for single integrators whose condition "
@@ -75,7 +81,8 @@ def finish(config: Config, pieces: Sequence[Record], seeds: Sequence[int]) -> Ou
     for k, row in enumerate(rows):
         ours = row["method"].startswith("ours")
         ax.errorbar(row["triggers"], row["formation_rmse_m"], yerr=row["formation_rmse_m_sd"],
-                    xerr=row["triggers_sd"], fmt="D" if ours else "o", color=CYCLE[k % len(CYCLE)], label=row["method"])  # fmt: skip
+                    xerr=row["triggers_sd"], fmt="D" if ours else "o", color=CYCLE[k % len(CYCLE)],
+                    label=row["method"])  # fmt: skip
     for method, values in config.published.items():
         ax.scatter(values["triggers"], values["formation_rmse_m"], marker="x", color=RED, zorder=4,
                    label="published" if method == next(iter(config.published)) else None)  # fmt: skip
@@ -84,10 +91,16 @@ def finish(config: Config, pieces: Sequence[Record], seeds: Sequence[int]) -> Ou
     ax.set(xscale="log", yscale="log", xlabel="messages of six UAVs in 15 s", ylabel="absolute formation RMSE (m)",
            title="Table 3: messages against error")  # fmt: skip
     ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=7)
-    outcome.figures.append(Figure("table3_messages", "Messages against absolute formation RMSE; crosses are published.", fig))
+    outcome.figures.append(
+        Figure("table3_messages", "Messages against absolute formation RMSE; crosses are published.", fig)
+    )
     fig, axes = panels(1, 1, 7.2, 3.0)
     ax = axes[0, 0]
-    for name, colour in (("switching (paper), literal", GREY), ("periodic, true 20 Hz", RED), ("ours: flown law", BLUE)):
+    for name, colour in (
+        ("switching (paper), literal", GREY),
+        ("periodic, true 20 Hz", RED),
+        ("ours: flown law", BLUE),
+    ):
         flight = run(config.cases()[name], seeds[0])
         ax.plot(flight.time_s, np.linalg.norm(flight.velocity_m_s.mean(axis=1), axis=1), color=colour, label=name)
     ax.set(xlabel="time (s)", ylabel="mean speed (m/s)", title="Eq. (2) with held neighbours brakes", ylim=(0, 1.15))

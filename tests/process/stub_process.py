@@ -6,6 +6,7 @@ import pickle
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from multiprocessing.process import BaseProcess
@@ -20,9 +21,11 @@ QUICK = (
     ("MPC_TKO_SPEED", 2.5),
     ("MPC_LAND_SPEED", 1.4),
     ("MPC_LAND_CRWL", 1.0),
+    ("LNDMC_TRIG_TIME", 0.3),
     ("COM_DISARM_LAND", 0.3),
+    ("COM_OF_LOSS_T", 5.0),
 )
-"""parameters of a vehicle in a hurry"""
+"""parameters of a vehicle in a hurry, on a machine that may stall"""
 
 
 def free_ports(count: int) -> list[int]:
@@ -75,6 +78,19 @@ def running(settings: StubFleetSettings) -> Iterator[BaseProcess]:
         if process.is_alive():
             process.kill()
             process.join()
+
+
+def wait_until_bound(port: int, at_most_s: float = 20.0) -> None:
+    """Returns once somebody has the port."""
+    end_s = time.monotonic() + at_most_s
+    while time.monotonic() < end_s:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
+                probe.bind(("127.0.0.1", port))
+            except OSError:
+                return
+        time.sleep(0.02)
+    raise TimeoutError(f"nobody has bound port {port}")
 
 
 @contextmanager

@@ -108,7 +108,8 @@ def in_file(path: str) -> str:
 @pytest.mark.parametrize("path", NUMBERS)
 def test_every_number_that_is_not_finite_or_absurd_or_no_number_is_refused_by_name(path: str) -> None:
     parse(with_every_number(), "fleet.toml")
-    for value in (NAN, INF, -INF, 1e300, -1e300, True, "4", [1.0], {}):
+    wrong: tuple[object, ...] = (NAN, INF, -INF, 1e300, -1e300, True, "4", [1.0], {})
+    for value in wrong:
         tables = with_every_number()
         put(path, value)(tables)
         with pytest.raises(ConfigError) as caught:
@@ -426,7 +427,8 @@ def test_legs_begin_where_the_one_before_ends() -> None:
     assert away.duration_s == pytest.approx(1.875 * 50.0)
     assert hold == VelocityLeg((0.0, 0.0, 0.0), 3.0)  # type: ignore[arg-type]
     assert isinstance(up, GotoLeg)
-    assert (up.target_ned_m.down, up.duration_s) == (-20.0, pytest.approx(1.875 * 10.0))
+    assert up.target_ned_m.down == -20.0
+    assert up.duration_s == pytest.approx(1.875 * 10.0)
     assert turn == TurnLeg(math.radians(-6.0), math.inf)
 
 

@@ -484,6 +484,28 @@ def test_each_limit_is_counted_once_a_tick() -> None:
     assert set(f.counts.values()) == {5}
 
 
+def test_a_calm_tick_after_a_hard_one_counts_nothing() -> None:
+    f = settled(replace(LIMITS, jerk_max_m_s3=1e9))
+    applied(f, command(Ned(90.0, 0.0, 0.0)), state())
+    counted = dict(f.counts)
+    applied(f, command(), state())
+    assert counted == {"acceleration": 1}
+    assert f.counts == counted
+
+
+def test_a_blocked_vehicle_passes_the_one_that_blocks_it_most() -> None:
+    ahead, beside = peer(Ned(1.3, 0.0, 0.0), vehicle_id=3), peer(Ned(1.5, -1.0, 0.0), vehicle_id=2)
+    ego, c = state(velocity=Ned(1.0, 0.0, 0.0)), command(Ned(5.0, -2.0, 0.0))
+    for n in (ahead, beside):
+        plane = half_plane(ego, ZERO, n)
+        assert plane.g_north * 5.0 + plane.g_east * -2.0 < plane.b
+    both, alone = (
+        applied(settled(replace(LIMITS, jerk_max_m_s3=1e9)), c, ego, others) for others in ([beside, ahead], [ahead])
+    )
+    assert acceleration(both) == pytest.approx(acceleration(alone))
+    assert both.acceleration_east_m_s2 > -2.0
+
+
 def test_reset_forgets_what_was_flown() -> None:
     f = SafetyFilter(LIMITS)
     for _ in range(50):

@@ -1,0 +1,395 @@
+"""One autopilot as its companion sees it: clock, requests, origin, readiness."""
+
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pymavlink.dialects.v20 import development as dialect
+
+from companion.autopilot import LATENCY_WINDOW_NS, RETRY_S, TRIES, AutopilotClient, BootClock
+from companion.core.frames import Geodetic, Ned, ned_to_geodetic
+from companion.core.values import Instant
+from companion.wire import mavlink as wire
+from companion.wire.mavlink import MavlinkLink, Px4Mode
+
+SYSTEM_ID = 7
+FLEET = Geodetic(47.397742, 8.545594, 488.0)
+DELAY_S = 0.001
+ESTIMATOR_OK = 1 | 2 | 4 | 8 | 16
+
+
+def at(seconds: float) -> Instant:
+    return Instant(round(seconds * 1e9), 1_700_000_000_000_000_000 + round(seconds * 1e9))
+
+
+class Px4:
+    """The other end of the link, by hand."""
+
+    def __init__(self, client: AutopilotClient) -> None:
+        self.client = client
+        self.mav: Any = dialect.MAVLink(None, srcSystem=SYSTEM_ID, srcComponent=1)
+        self.asked: list[tuple[float, Any]] = []
+
+    def says(self, message: Any, seconds: float) -> bool:
+        return self.client.receive(bytes(message.pack(self.mav)), at(seconds))
+
+    def heartbeat(self, seconds: float, armed: bool = False, mode: int = 0, kind: int = 12, type_: int = 2) -> None:
+        self.says(dialect.MAVLink_heartbeat_message(type_, kind, 128 * armed | 1, int(mode), 3, 3), seconds)
+
+    def position(self, seconds: float, *numbers: float, boot_ms: int | None = None) -> bool:
+        values = numbers or (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        boot = round((seconds - DELAY_S) * 1000) if boot_ms is None else boot_ms
+        return self.says(dialect.MAVLink_local_position_ned_message(boot, *values), seconds)
+
+    def origin(self, seconds: float, ned_m: Ned = Ned(0.0, 0.0, 0.0)) -> None:  # noqa: B008 (a value)
+        where = ned_to_geodetic(ned_m, FLEET)
+        self.says(
+            dialect.MAVLink_gps_global_origin_message(
+                round(where.latitude_deg * 1e7), round(where.longitude_deg * 1e7), round(where.altitude_amsl_m * 1e3), 0
+            ),
+            seconds,
+        )  # fmt: skip
+
+    def answer(self, command: int, result: int, seconds: float) -> None:
+        self.says(dialect.MAVLink_command_ack_message(command, result, 0, 0, SYSTEM_ID, 191), seconds)
+
+    def hear(self, seconds: float) -> list[Any]:
+        """What the client sends now."""
+        out = []
+        for datagram in self.client.due(at(seconds)):
+            parsed = dialect.MAVLink(None).parse_buffer(bytearray(datagram))
+            assert parsed is not None
+            out += parsed
+        self.asked += [(seconds, m) for m in out if m.get_type() == "COMMAND_LONG"]
+        return out
+
+    def times_of(self, command: int, first: float | None = None) -> list[float]:
+        return [t for t, m in self.asked if m.command == command and (first is None or m.param1 == first)]
+
+    def run(self, start_s: float, end_s: float, period_s: float = 0.05) -> None:
+        """Let the client ask for a while, without an answer."""
+        for k in range(round((end_s - start_s) / period_s)):
+            self.hear(start_s + k * period_s)
+
+
+def px4(origin: Geodetic | None = FLEET) -> Px4:
+    return Px4(AutopilotClient(MavlinkLink(SYSTEM_ID), origin))
+
+
+def ready(at_s: float = 10.0) -> Px4:
+    """An autopilot that may take off at `at_s`."""
+    one = px4()
+    one.heartbeat(at_s)
+    one.origin(at_s)
+    one.position(at_s)
+    one.says(dialect.MAVLink_estimator_status_message(0, ESTIMATOR_OK, 0, 0, 0, 0, 0, 0, 0.5, 0.5), at_s)
+    return one
+
+
+# -- clock -------------------------------------------------------------------------------------------------------------
+
+
+@given(st.lists(st.floats(0.0, 0.4), min_size=1, max_size=25))
+def test_the_least_delayed_message_tells_the_offset_and_the_others_their_delay(delays: list[float]) -> None:
+    clock = BootClock()
+    least = 1.0
+    for k, delay in enumerate(delays):
+        made_s = k * 0.02
+        arrived_ns = round((100.0 + made_s + delay) * 1e9)
+        least = min(least, delay)
+        made_ns = clock.arrived(round(made_s * 1000), arrived_ns)
+        assert (arrived_ns - made_ns) * 1e-9 == pytest.approx(delay - least, abs=1e-6)
+
+
+def test_an_old_minimum_is_forgotten_after_its_window() -> None:
+    clock = BootClock()
+    clock.arrived(0, 0)
+    for k in range(1, 20):
+        made = clock.arrived(k * 100, k * 100_000_000 + 50_000_000)
+        expected = 50_000_000 if k * 100_000_000 + 50_000_000 <= LATENCY_WINDOW_NS else 0
+        assert k * 100_000_000 + 50_000_000 - made == expected
+
+
+def test_a_position_is_carried_on_by_its_age() -> None:
+    one = ready(10.0)
+    for k in range(20):
+        one.position(10.02 + 0.02 * k, 1.0, 2.0, -3.0, 1.0, -2.0, 0.5)
+    one.position(10.52, 1.0, 2.0, -3.0, 1.0, -2.0, 0.5, boot_ms=round(10.45 * 1000) - 1)
+    state = one.client.state(at(10.55))
+    assert state is not None
+    position, velocity = state
+    assert velocity == (1.0, -2.0, 0.5)
+    assert position == pytest.approx((1.1, 1.8, -2.95), abs=0.002)
+
+
+def test_a_position_is_stale_half_a_second_after_it_was_made() -> None:
+    one = ready(10.0)
+    assert one.client.state(at(10.499)) is not None
+    assert one.client.state(at(10.501)) is None
+
+
+def test_a_position_that_comes_twice_or_late_is_counted_and_changes_nothing() -> None:
+    one = ready(10.0)
+    assert one.position(10.02, 5.0, 0.0, 0.0, 0.0, 0.0, 0.0, boot_ms=10_100)
+    assert not one.position(10.04, 6.0, 0.0, 0.0, 0.0, 0.0, 0.0, boot_ms=10_100)
+    assert not one.position(10.06, 7.0, 0.0, 0.0, 0.0, 0.0, 0.0, boot_ms=9_500)
+    assert one.client.position_ned_m.north == pytest.approx(5.0, abs=0.02)
+    assert one.client.counts["position repeated"] == 2
+
+
+def test_a_reboot_forgets_clock_and_origin_and_sets_the_streams_up_anew() -> None:
+    one = ready(100.0)
+    one.hear(100.0)
+    before = len(one.times_of(511))
+    assert not one.position(110.0, boot_ms=2_000)
+    assert one.client.counts["autopilot reboot"] == 1
+    assert "estimator origin unknown" in one.client.unready(at(110.0))
+    one.origin(110.1)
+    assert one.position(110.2, boot_ms=2_200)
+    one.hear(110.2)
+    assert len(one.times_of(511)) > before
+    assert one.client.state(at(110.2)) is not None
+
+
+# -- requests ----------------------------------------------------------------------------------------------------------
+
+
+def test_nothing_but_heartbeats_is_sent_before_the_autopilot_is_heard() -> None:
+    one = px4()
+    heard = [m.get_type() for k in range(60) for m in one.hear(0.05 * k)]
+    assert heard == ["HEARTBEAT"] * 3
+
+
+def test_a_heartbeat_goes_out_every_second() -> None:
+    one = ready()
+    beats = [0.05 * k for k in range(200) if any(m.get_type() == "HEARTBEAT" for m in one.hear(10.0 + 0.05 * k))]
+    assert len(beats) == 10
+
+
+def test_the_streams_are_asked_for_one_after_the_other() -> None:
+    one = px4()
+    one.heartbeat(0.0)
+    wanted = [*wire.STREAMS_HZ, *wire.STREAMS_OFF]
+    for k, message_id in enumerate(wanted):
+        now = 0.01 * k
+        one.hear(now)
+        assert one.times_of(511, message_id) == [now]
+        assert len(one.times_of(511)) == k + 1
+        one.answer(511, 0, now)
+
+
+def test_a_request_is_repeated_until_it_is_answered() -> None:
+    one = ready()
+    one.client.ask("arming", *wire.arm_parameters(True))
+    one.run(10.0, 11.2)
+    assert one.times_of(400) == pytest.approx([10.0, 10.5, 11.0])
+    one.answer(400, 0, 11.2)
+    one.run(11.2, 14.0)
+    assert len(one.times_of(400)) == 3
+
+
+def test_a_request_that_is_never_answered_is_given_up_and_noted() -> None:
+    one = ready()
+    one.client.ask("arming", *wire.arm_parameters(True))
+    one.run(10.0, 10.0 + TRIES * RETRY_S + 1.0)
+    assert len(one.times_of(400)) == TRIES
+    assert "autopilot never answered arming" in one.client.notes
+
+
+def test_the_same_request_is_not_queued_twice() -> None:
+    one = ready()
+    for _ in range(50):
+        one.client.ask("arming", *wire.arm_parameters(True))
+    one.hear(10.0)
+    one.answer(400, 0, 10.01)
+    one.run(10.05, 12.0)
+    assert one.times_of(400) == [10.0]
+
+
+def test_a_refusal_is_noted_and_the_request_not_repeated_at_once() -> None:
+    one = ready()
+    for k in range(100):
+        now = 10.0 + 0.02 * k
+        one.client.ask("arming", *wire.arm_parameters(True))
+        if any(m.get_type() == "COMMAND_LONG" and m.command == 400 for m in one.hear(now)):
+            one.answer(400, 2, now + 0.001)
+    assert 3 <= len(one.times_of(400)) <= 5
+    assert one.client.counts["refused: arming"] == len(one.times_of(400))
+    assert one.client.notes[0] == "autopilot refused arming (result 2)"
+
+
+@pytest.mark.parametrize("result", [1, 5], ids=["temporarily rejected", "in progress"])
+def test_an_answer_that_decides_nothing_leaves_the_request_open(result: int) -> None:
+    one = ready()
+    one.client.ask("arming", *wire.arm_parameters(True))
+    one.hear(10.0)
+    one.answer(400, result, 10.1)
+    one.run(10.1, 11.0)
+    assert one.times_of(400) == pytest.approx([10.0, 10.6])
+    assert not one.client.notes
+
+
+def test_an_answer_to_nothing_asked_is_counted() -> None:
+    one = ready()
+    one.answer(400, 0, 10.0)
+    one.client.ask("arming", *wire.arm_parameters(True))
+    one.answer(400, 0, 10.0)
+    one.hear(10.0)
+    assert one.times_of(400) == [10.0]
+    assert one.client.counts["answer to nothing asked"] == 2
+
+
+def test_a_new_mode_takes_the_place_of_the_one_before() -> None:
+    one = ready()
+    one.client.set_mode(Px4Mode.OFFBOARD)
+    one.hear(10.0)
+    one.client.set_mode(Px4Mode.AUTO_LAND)
+    one.run(10.05, 12.0)
+    modes = [(m.param2, m.param3) for _, m in one.asked if m.command == 176]
+    assert modes[0] == (6.0, 0.0)
+    assert set(modes[1:]) == {(4.0, 6.0)}
+
+
+def test_what_is_withdrawn_is_not_repeated_and_its_late_answer_is_no_surprise() -> None:
+    one = ready()
+    one.client.ask("take-off", *wire.takeoff_parameters(498.0))
+    one.hear(10.0)
+    one.client.withdraw("take-off", "arming")
+    one.run(10.05, 10.4)
+    one.answer(22, 2, 10.4)
+    one.run(10.4, 16.0)
+    assert one.times_of(22) == [10.0]
+    assert one.client.counts["answer to nothing asked"] == 0
+    assert one.client.counts["refused: take-off"] == 0
+    assert not any("take-off" in note for note in one.client.notes)
+
+
+def test_what_is_withdrawn_before_it_was_sent_is_never_sent() -> None:
+    one = ready()
+    one.client.ask("arming", *wire.arm_parameters(True))
+    one.client.withdraw("arming")
+    one.run(10.0, 12.0)
+    assert one.times_of(400) == []
+
+
+def test_after_cancelling_nothing_but_heartbeats_is_sent() -> None:
+    one = ready()
+    one.client.ask("arming", *wire.arm_parameters(True))
+    one.client.set_mode(Px4Mode.OFFBOARD)
+    one.client.cancel()
+    one.run(10.0, 15.0)
+    assert one.asked == []
+
+
+def test_the_next_deadline_is_when_something_is_due() -> None:
+    one = ready()
+    one.run(10.0, 20.0)
+    one.client.ask("arming", *wire.arm_parameters(True))
+    deadlines = []
+    now_ns = at(20.0).monotonic_ns
+    for _ in range(30):
+        now_ns = max(now_ns, one.client.next_deadline_ns())
+        deadlines.append(now_ns)
+        one.client.due(Instant(now_ns, 0))
+        assert one.client.next_deadline_ns() > now_ns or one.client.next_deadline_ns() == 0
+        now_ns += 1
+    assert deadlines == sorted(deadlines)
+    assert deadlines[-1] > at(24.0).monotonic_ns
+
+
+# -- origin and frame --------------------------------------------------------------------------------------------------
+
+
+def test_the_origin_is_asked_for_each_second_until_it_comes() -> None:
+    one = px4()
+    one.heartbeat(0.0)
+    one.run(0.0, 3.0)
+    assert len(one.times_of(512, 49)) == 3
+    one.origin(3.0)
+    one.run(3.0, 8.0)
+    assert len(one.times_of(512, 49)) == 3
+
+
+def test_positions_are_those_of_the_fleet_frame_once_the_origin_is_known() -> None:
+    one = px4()
+    assert not one.position(1.0, 1.0, 2.0, -3.0, 0.0, 0.0, 0.0)
+    one.origin(1.5, Ned(10.0, -20.0, 0.5))
+    assert one.position(2.0, 1.0, 2.0, -3.0, 0.0, 0.0, 0.0)
+    assert one.client.position_ned_m == pytest.approx((11.0, -18.0, -2.5), abs=0.02)
+
+
+def test_an_origin_that_moves_moves_the_frame_and_is_noted() -> None:
+    one = ready()
+    one.origin(11.0, Ned(4.0, -3.0, 0.5))
+    one.position(11.1, 1.0, 1.0, -1.0, 0.0, 0.0, 0.0)
+    assert one.client.position_ned_m == pytest.approx((5.0, -2.0, -0.5), abs=0.02)
+    assert one.client.counts["estimator origin moved"] == 1
+    one.origin(12.0, Ned(4.0, -3.0, 0.5))
+    assert one.client.counts["estimator origin moved"] == 1
+
+
+def test_in_a_local_frame_the_autopilots_frame_is_the_fleets() -> None:
+    one = px4(None)
+    one.heartbeat(0.0)
+    assert one.position(1.0, 1.0, 2.0, -3.0, 0.0, 0.0, 0.0)
+    one.origin(1.5, Ned(10.0, -20.0, 0.5))
+    assert one.position(2.0, 1.0, 2.0, -3.0, 0.0, 0.0, 0.0)
+    assert one.client.position_ned_m == (1.0, 2.0, -3.0)
+    one.run(0.0, 3.0)
+    assert one.times_of(512) == []
+
+
+# -- readiness ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_ready_autopilot_gives_no_reason() -> None:
+    assert ready().client.unready(at(10.1)) == []
+
+
+def test_readiness_names_each_reason_by_itself() -> None:
+    assert px4().client.unready(at(0.0)) == ["no heartbeat from the autopilot"]
+    silent = ready()
+    silent.position(13.4)
+    assert silent.client.unready(at(13.5)) == ["no heartbeat for 4 s"]
+    other = ready()
+    other.heartbeat(10.0, kind=3)
+    assert other.client.unready(at(10.1)) == ["autopilot is no PX4 (MAV_AUTOPILOT 3)"]
+    plane = ready()
+    plane.heartbeat(10.0, type_=1)
+    assert plane.client.unready(at(10.1)) == ["vehicle is no multicopter (MAV_TYPE 1)"]
+    nowhere = px4()
+    nowhere.heartbeat(10.0)
+    nowhere.says(dialect.MAVLink_estimator_status_message(0, ESTIMATOR_OK, 0, 0, 0, 0, 0, 0, 0.5, 0.5), 10.0)
+    assert nowhere.client.unready(at(10.1)) == ["estimator origin unknown"]
+    stale = ready()
+    assert stale.client.unready(at(10.6)) == ["no position within 0.5 s"]
+    unsure = ready()
+    unsure.says(dialect.MAVLink_estimator_status_message(0, 1 | 2 | 4 | 8, 0, 0, 0, 0, 0, 0, 0.5, 0.5), 10.0)
+    assert unsure.client.unready(at(10.1)) == ["estimator not ready (flags 0xf, needs 0x17)"]
+
+
+def test_reasons_are_told_together() -> None:
+    one = px4()
+    one.heartbeat(0.0, kind=3)
+    assert len(one.client.unready(at(5.0))) == 4
+
+
+def test_a_local_frame_needs_a_relative_position_only() -> None:
+    one = px4(None)
+    one.heartbeat(10.0)
+    one.position(10.0)
+    one.says(dialect.MAVLink_estimator_status_message(0, 1 | 2 | 4 | 8, 0, 0, 0, 0, 0, 0, 0.5, 0.5), 10.0)
+    assert one.client.unready(at(10.1)) == []
+
+
+def test_state_of_the_autopilot_is_what_it_last_said() -> None:
+    one = ready()
+    one.heartbeat(10.0, armed=True, mode=int(Px4Mode.OFFBOARD))
+    one.says(dialect.MAVLink_extended_sys_state_message(0, 2), 10.0)
+    one.says(dialect.MAVLink_sys_status_message(0, 0, 0, 0, 0, 0, 55, 0, 0, 0, 0, 0, 0), 10.0)
+    client = one.client
+    assert (client.armed, client.custom_mode) == (True, Px4Mode.OFFBOARD)
+    assert (client.landed_state, client.battery_percent) == (2, 55)
+    one.says(dialect.MAVLink_current_mode_message(0, int(Px4Mode.POSCTL), 0), 10.1)
+    assert client.custom_mode == Px4Mode.POSCTL

@@ -1,0 +1,200 @@
+"""The operator's verbs: what is sent to whom, and what is made of the answers."""
+
+import json
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from math import inf, pi, radians
+from pathlib import Path
+
+import pytest
+
+from companion.config import FleetConfig, load
+from companion.core.frames import Ned
+from companion.core.plan import GotoLeg, Motion, TurnLeg, VelocityLeg, with_formation, with_legs
+from companion.errors import ConfigError, RefusedError
+from companion.operate import COMMAND_LEAD_NS, Answers, Operator, turn_leg, velocity_leg
+from companion.wire.peer import decode_motion, encode_motion
+
+CONFIG = load(Path(__file__).resolve().parents[2] / "fleet.toml", lambda t: t.update(vehicle=t["vehicle"][:4]))
+NOW_NS = 1_700_000_100_000_000_000
+
+
+def formed(config: FleetConfig = CONFIG) -> Motion:
+    return with_formation(
+        config.first_motion, at_ns=NOW_NS - 20_000_000_000, issuer=3, shape="v", slots=config.slots("v"), pinned={},
+        speed_m_s=2.0,
+    )  # fmt: skip
+
+
+@dataclass
+class Fleet:
+    """Vehicles that hold given motions and answer as they are told to; a real Link without a network."""
+
+    motions: dict[int, Motion | None]
+    """None: silent"""
+    refusals: dict[int, str] = field(default_factory=dict)
+    came: list[tuple[int, str, bytes]] = field(default_factory=list)
+
+    def ask(
+        self, vehicle_ids: Iterable[int], kind: str, payload: bytes, timeout_s: float, retry_s: float
+    ) -> dict[int, bytes | None]:
+        assert 0 < retry_s < timeout_s
+        answers: dict[int, bytes | None] = {}
+        for i in vehicle_ids:
+            motion = self.motions[i]
+            self.came.append((i, kind, payload))
+            if motion is None:
+                answers[i] = None
+            elif kind == "status":
+                answers[i] = json.dumps({"vehicle": i, "motion": json.loads(encode_motion(motion))}).encode()
+            else:
+                reason = self.refusals.get(i)
+                answers[i] = json.dumps({"vehicle": i, "accepted": reason is None, "reason": reason}).encode()
+        return answers
+
+    def commands(self) -> list[bytes]:
+        return [payload for _, kind, payload in self.came if kind == "command"]
+
+    def motion(self) -> Motion:
+        """The one motion that everybody was sent."""
+        (payload,) = set(self.commands())
+        command = json.loads(payload)
+        assert command["verb"] == "motion"
+        return decode_motion(json.dumps(command["motion"]).encode())
+
+
+def fleet(newest: Motion | None = None) -> Fleet:
+    return Fleet({i: newest or formed() for i in range(1, 5)})
+
+
+def test_every_vehicle_is_sent_the_same_bytes_and_all_accept() -> None:
+    link = fleet()
+    answers = Operator(CONFIG, link).take_off()
+    assert answers.all_accepted
+    assert [i for i, _, _ in link.came] == [1, 2, 3, 4]
+    assert {json.loads(p)["verb"] for p in link.commands()} == {"takeoff"}
+    assert len(set(link.commands())) == 1
+
+
+def test_refusals_and_silence_are_told_by_vehicle() -> None:
+    link = fleet()
+    link.motions[4] = None
+    link.refusals[2] = "no heartbeat from the autopilot"
+    answers = Operator(CONFIG, link).land()
+    assert answers == Answers((1, 3), {2: "no heartbeat from the autopilot"}, (4,))
+    assert not answers.all_accepted
+    sentence = "land: accepted by 2; vehicle 2 refused: no heartbeat from the autopilot; silent: vehicle 4"
+    assert answers.sentence("land") == sentence
+
+
+def test_status_keeps_the_silent_apart() -> None:
+    link = fleet()
+    link.motions[1] = None
+    status = Operator(CONFIG, link).status()
+    assert status[1] is None
+    assert status[2] is not None
+    assert status[2]["vehicle"] == 2
+
+
+def test_a_new_formation_follows_the_newest_motion_that_anyone_holds() -> None:
+    newest = formed()
+    newer = with_legs(newest, at_ns=NOW_NS - 1, issuer=4, legs=(VelocityLeg(Ned(1.0, 0.0, 0.0), 60.0),))
+    link = fleet(newest)
+    link.motions[3] = newer
+    assert Operator(CONFIG, link).form("line", NOW_NS).all_accepted
+    motion = link.motion()
+    assert (motion.revision, motion.issuer, motion.shape) == (newer.revision + 1, 0, "line")
+    assert motion.start_ns == NOW_NS + COMMAND_LEAD_NS
+    assert motion.legs == newer.legs
+    for i in range(1, 5):
+        before, after = newer.reference(i, motion.start_ns), motion.reference(i, motion.start_ns)
+        assert before.position_ned_m == pytest.approx(after.position_ned_m, abs=1e-9)
+
+
+def test_a_command_never_starts_before_the_motion_that_it_follows() -> None:
+    ahead = with_legs(formed(), at_ns=NOW_NS + 60_000_000_000, issuer=1, legs=())
+    link = fleet(ahead)
+    Operator(CONFIG, link).hold(NOW_NS)
+    assert link.motion().start_ns == ahead.start_ns + 1
+
+
+def test_hold_stops_the_centre_and_move_sends_it_on() -> None:
+    moving = with_legs(formed(), at_ns=NOW_NS - 10_000_000_000, issuer=1, legs=(VelocityLeg(Ned(1.0, 0.0, 0.0), 60.0),))
+    link = fleet(moving)
+    Operator(CONFIG, link).hold(NOW_NS)
+    held = link.motion()
+    late = held.moment(NOW_NS + 30_000_000_000).centre
+    assert late.velocity == (0.0, 0.0, 0.0)
+    link = fleet(held)
+    Operator(CONFIG, link).move(velocity_leg(0.0, 1.0, 0.5), NOW_NS)
+    assert link.motion().moment(NOW_NS + 60_000_000_000).centre.velocity == pytest.approx((0.0, 1.0, -0.5))
+
+
+def test_goto_flies_the_centre_to_the_point_and_stops_there() -> None:
+    link = fleet()
+    Operator(CONFIG, link).goto(30.0, 40.0, None, 1.0, NOW_NS)
+    motion = link.motion()
+    (leg,) = motion.legs
+    assert isinstance(leg, GotoLeg)
+    assert leg.duration_s == pytest.approx(1.875 * 50.0, rel=0.01)
+    end = motion.moment((motion.end_ns or 0) + 1).centre
+    assert end.position == pytest.approx((30.0, 40.0, -10.0))
+    assert end.velocity == pytest.approx((0.0, 0.0, 0.0))
+    link = fleet()
+    Operator(CONFIG, link).goto(0.0, 0.0, 15.0, 1.0, NOW_NS)
+    (leg,) = link.motion().legs
+    assert isinstance(leg, GotoLeg)
+    assert leg.target_ned_m.down == -15.0
+
+
+def test_legs_of_the_command_line() -> None:
+    assert velocity_leg(1.0, 2.0, 0.5) == VelocityLeg(Ned(1.0, 2.0, -0.5), 0.0)
+    assert turn_leg(6.0, 90.0) == TurnLeg(radians(6.0), 90.0 * pi / 180.0)
+    assert turn_leg(-6.0, None) == TurnLeg(radians(-6.0), inf)
+
+
+def test_nothing_is_commanded_when_nobody_says_where_the_fleet_is() -> None:
+    link = Fleet(dict.fromkeys(range(1, 5)))
+    with pytest.raises(RefusedError, match="no vehicle answers"):
+        Operator(CONFIG, link).hold(NOW_NS)
+    assert link.commands() == []
+
+
+def test_an_unknown_shape_is_refused_before_anybody_is_asked() -> None:
+    link = fleet()
+    with pytest.raises(ConfigError, match="must be one of v, line"):
+        Operator(CONFIG, link).form("star", NOW_NS)
+    assert link.came == []
+
+
+def test_before_the_fleet_has_formed_by_itself_no_motion_takes_the_place_of_forming() -> None:
+    link = fleet(CONFIG.first_motion)
+    operator = Operator(CONFIG, link)
+    acts: list[Callable[[], Answers]] = [
+        lambda: operator.form("line", NOW_NS),
+        lambda: operator.hold(NOW_NS),
+        lambda: operator.move(velocity_leg(1.0, 0.0, 0.0), NOW_NS),
+        lambda: operator.goto(1.0, 1.0, None, 1.0, NOW_NS),
+    ]
+    for act in acts:
+        with pytest.raises(RefusedError, match="not in formation yet"):
+            act()
+    assert link.commands() == []
+
+
+def test_a_fleet_that_waits_for_its_operator_is_formed_by_him() -> None:
+    config = CONFIG.model_copy(update={"plan": CONFIG.plan.model_copy(update={"automatic": False})})
+    link = fleet(config.first_motion)
+    assert Operator(config, link).form("line", NOW_NS).all_accepted
+    assert link.motion().revision == 1
+
+
+def test_a_vehicle_whose_plan_cannot_be_read_is_named() -> None:
+    class Strange(Fleet):
+        def ask(
+            self, vehicle_ids: Iterable[int], kind: str, payload: bytes, timeout_s: float, retry_s: float
+        ) -> dict[int, bytes | None]:
+            return {i: json.dumps({"vehicle": i, "motion": {"version": 9}}).encode() for i in vehicle_ids}
+
+    with pytest.raises(RefusedError, match="vehicle 1 tells a plan that cannot be read"):
+        Operator(CONFIG, Strange({})).hold(NOW_NS)
