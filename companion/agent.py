@@ -435,9 +435,11 @@ class Agent:
     def _law(self, ego: VehicleState, reference: Reference, neighbours: list[Neighbour]) -> tuple[Command, Ned]:
         """The law's command and the mean residual to the neighbours in formation.
 
-        Altitude is flown by position, so the vertical errors are left out of the horizontal budget.
+        Altitude is flown by position, so the vertical errors are left out of the horizontal budget. Velocities are
+        compared as they differ from what the plan asks of each slot: slots that turn or change places have their own.
         """
         p, v, g = ego.position_ned_m, ego.velocity_ned_m_s, self._gains
+        r, rv, ra, yaw = reference
         sums, count = NO_SUMS, 0
         apart = (0.0, 0.0)
         for n in neighbours:
@@ -445,13 +447,13 @@ class Agent:
             dx, dy, dz = p.north - q.north, p.east - q.east, p.down - q.down
             if n.in_formation:
                 count += 1
-                one = pair(dx, dy, dz, v.north - w.north, v.east - w.east, 0.0, d.north, d.east, dz, g)
-                sums = add(sums, one)
+                s = n.reference_velocity_ned_m_s
+                dvx, dvy = v.north - w.north - (rv.north - s.north), v.east - w.east - (rv.east - s.east)
+                sums = add(sums, pair(dx, dy, dz, dvx, dvy, 0.0, d.north, d.east, dz, g))
             elif n.other_end_ned_m is None:
-                s = separation(dx, dy, dz, g)
-                apart = (apart[0] + s[0], apart[1] + s[1])
+                away = separation(dx, dy, dz, g)
+                apart = (apart[0] + away[0], apart[1] + away[1])
         sums = sums._replace(sep_x=sums.sep_x + apart[0], sep_y=sums.sep_y + apart[1], sep_z=0.0)
-        r, rv, ra, yaw = reference
         u = finish(
             count, sums,
             p.north - r.north, p.east - r.east, 0.0,
@@ -640,6 +642,8 @@ class Agent:
 
     def _tell(self, now: Instant, residual: Ned, reference: Reference) -> None:
         since_s = (now.monotonic_ns - self._sent_ns) * 1e-9
+        if self._sent is None:
+            self._announce(now)
         due = bool(self._resend_ns) and now.monotonic_ns >= self._resend_ns[0]
         if due:
             self._resend_ns = [t for t in self._resend_ns if t > now.monotonic_ns]

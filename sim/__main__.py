@@ -22,6 +22,9 @@ USAGE_ERROR = 2
 
 FleetFile = Annotated[Path, typer.Option("--fleet", help="The fleet's configuration.")]
 Vehicles = Annotated[int | None, typer.Option(min=1, max=250, help="Fly this many, whatever the file lists.")]
+Parameters = Annotated[
+    list[str] | None, typer.Option(metavar="NAME=VALUE", help="With --autopilot px4: a PX4 parameter, repeatable.")
+]
 DEFAULT_FILE = Path("fleet.toml")
 
 
@@ -101,6 +104,7 @@ def up(
     ] = None,
     autopilot: Annotated[str, typer.Option(help="What flies: stub, px4 (SITL) or external (runs already).")] = "stub",
     px4: Annotated[Path | None, typer.Option(help="With --autopilot px4: PX4's build folder.")] = None,
+    parameter: Parameters = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of gusts, noise and estimator origins.")] = 0,
     calm: Annotated[bool, typer.Option("--calm", help="No gusts and no sensor noise.")] = False,
     out: Annotated[Path, typer.Option(help="Folder for the flight's folder.")] = Path("flights"),
@@ -111,7 +115,7 @@ def up(
     Ctrl-C lands the fleet. Exit status: 0 the flight met its criteria, 1 it did not, 2 wrong usage or configuration.
     """
     from sim.launch import FlightOptions, flight_folder, fly
-    from sim.sitl import check_build
+    from sim.sitl import check_build, parse_parameters
     from sim.stub_fleet import check_stub_links
     from sim.view import FlightView, show_summary
 
@@ -122,6 +126,9 @@ def up(
             "--autopilot px4 needs --px4 BUILD_DIR (get PX4-Autopilot v1.16 from its project, run "
             "`make px4_sitl_default` and pass build/px4_sitl_default), and --px4 needs --autopilot px4"
         )
+    parse_parameters(parameter or ())
+    if parameter and px4 is None:
+        raise ConfigError("--parameter is for the instances of --autopilot px4")
     if px4 is not None:
         px4 = check_build(px4)
     tables = _tables(fleet, vehicles, formation, plan)
@@ -132,7 +139,7 @@ def up(
     config = parse(tables, fleet.name)
     if autopilot == "stub":
         check_stub_links(config)
-    options = FlightOptions(flight_folder(out), seed, duration, px4, autopilot == "external")
+    options = FlightOptions(flight_folder(out), seed, duration, px4, tuple(parameter or ()), autopilot == "external")
     interrupted = _interrupts()
     with FlightView(quiet=as_json) as view:
         summary = fly(tables, options, view.show, interrupted)
@@ -184,14 +191,18 @@ def stub(
 
 @app.command(hidden=True)
 def sitl(
-    px4: Annotated[Path, typer.Option()], truth: Annotated[Path, typer.Option()], fleet: FleetFile = DEFAULT_FILE
+    px4: Annotated[Path, typer.Option()],
+    truth: Annotated[Path, typer.Option()],
+    fleet: FleetFile = DEFAULT_FILE,
+    parameter: Parameters = None,
 ) -> None:
     """Run PX4 SITL instances until standard input closes: for launchers."""
     from companion.config import parse
-    from sim.sitl import SitlHost, SitlSettings, check_build
+    from sim.sitl import SitlHost, SitlSettings, check_build, parse_parameters
 
     config = parse(_tables(fleet), fleet.name)
-    settings = SitlSettings(check_build(px4), truth.parent, truth, sys.stdin.fileno(), {})
+    parameters = parse_parameters(parameter or ())
+    settings = SitlSettings(check_build(px4), truth.parent, truth, sys.stdin.fileno(), parameters)
     SitlHost(config, settings).run(grace_s=1.5)
 
 

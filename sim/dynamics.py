@@ -200,6 +200,8 @@ def constrain_horizontal(
     first_north: float, first_east: float, second_north: float, second_east: float, limit: float
 ) -> tuple[float, float]:
     """Sum of two vectors, no longer than `limit`, keeping the first at the second's cost (ControlMath::constrainXY)."""
+    if limit <= 0.0:
+        return 0.0, 0.0
     north = first_north + second_north
     east = first_east + second_east
     if north * north + east * east <= limit * limit:

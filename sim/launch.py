@@ -47,6 +47,8 @@ class FlightOptions:
     """from the take-off command to landing; None: until the plan lands, or for ever"""
     px4: Path | None = None
     """PX4's build folder: fly SITL instances instead of stubs"""
+    parameters: tuple[str, ...] = ()
+    """of the SITL instances, NAME=VALUE each, beyond the launcher's own"""
     external: bool = False
     """fly autopilots that run already"""
 
@@ -173,7 +175,10 @@ def _fly(
     processes.start("reference", "sim", "reference-loop", "--out", str(folder / "reference.bin"))
     truth = folder / "truth.bin"
     if options.px4 is not None:
-        processes.start("autopilots", "sim", "sitl", "--fleet", file, "--px4", str(options.px4), "--truth", str(truth))
+        more = [word for p in options.parameters for word in ("--parameter", p)]
+        processes.start(
+            "autopilots", "sim", "sitl", "--fleet", file, "--px4", str(options.px4), "--truth", str(truth), *more
+        )
     elif not options.external:
         processes.start(
             "autopilots", "sim", "stub", "--fleet", file, "--seed", str(options.seed), "--truth", str(truth),

@@ -6,6 +6,7 @@ HIL_STATE_QUATERNION on 19410 + i, the state of arming and mode from the ground 
 """
 
 import os
+import re
 import select
 import signal
 import socket
@@ -15,7 +16,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from math import hypot
+from math import hypot, isfinite
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ import numpy as np
 
 from companion.config import FleetConfig, Vehicle, autopilot_port, companion_port
 from companion.core.frames import Geodetic, Ned, geodetic_to_ned, ned_to_geodetic
-from companion.errors import CompanionError
+from companion.errors import CompanionError, ConfigError
 from companion.io.link import SO_TIMESTAMPNS, received_unix_ns
 from companion.wire.mavlink import dialect as mavlink
 from companion.wire.mavlink import interval_parameters, parameter_value
@@ -55,6 +56,9 @@ FLEET_PARAMETERS: Mapping[str, float | int] = {
     "SDLOG_MODE": -1,
 }
 """a fleet without RC: land when the setpoints end; no stick input; no log on disk"""
+SIMULATOR_PARAMETERS: Mapping[str, float | int] = {"EKF2_ACC_NOISE": 1.0, "EKF2_GYR_NOISE": 0.1}
+"""what SIH's sensors are like: in flight their white noise is 0.5, 1.7 and 1.4 m/s^2 and 0.14, 0.07 and 0.03 rad/s a
+sample, of which the estimator's defaults (0.35 and 0.015) know nothing, so that it wanders by half a metre"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,8 +72,25 @@ class SitlSettings:
     truth_path: Path
     stop_fd: int
     parameters: Mapping[str, float | int]
-    """beyond FLEET_PARAMETERS"""
+    """beyond FLEET_PARAMETERS and SIMULATOR_PARAMETERS, or instead of one of them"""
     log: Callable[[str], None] = print
+
+
+def parse_parameters(texts: Sequence[str]) -> dict[str, float | int]:
+    """PX4 parameters from the command line, NAME=VALUE each."""
+    parameters: dict[str, float | int] = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        try:
+            if not re.fullmatch("[A-Z][A-Z0-9_]{0,15}", name):
+                raise ValueError(name)
+            number = float(value)
+            if not isfinite(number):
+                raise ValueError(value)
+        except ValueError:
+            raise ConfigError(f"--parameter must be NAME=VALUE, a PX4 parameter and a number, got {text!r}") from None
+        parameters[name] = int(number) if number.is_integer() else number
+    return parameters
 
 
 def check_build(build: Path) -> Path:
@@ -164,7 +185,7 @@ class _Instance:
             )
         self.truth_socket = _bind(TRUTH_PORT + self.index, f"vehicle {vehicle.id}'s truth")
         home = ned_to_geodetic(Ned(vehicle.pad_north_m, vehicle.pad_east_m, 0.0), config.origin)
-        self.parameters = {**FLEET_PARAMETERS, **settings.parameters}
+        self.parameters = {**FLEET_PARAMETERS, **SIMULATOR_PARAMETERS, **settings.parameters}
         try:
             self.px4 = Px4Instance(
                 self.index, home, settings.build, settings.folder / f"px4-{vehicle.id}", self.parameters

@@ -5,6 +5,7 @@ elsewhere (measured: a client on any other port gets nothing).
 """
 
 import errno
+import logging
 import math
 import os
 import selectors
@@ -24,7 +25,9 @@ from companion.core.frames import Geodetic, Ned
 from companion.errors import CompanionError
 from sim.autopilot import NO_OFFSET, Autopilot
 from sim.dynamics import DynamicsParameters, GustParameters, NoiseParameters
+from sim.px4.faults import decode_order
 
+log = logging.getLogger(__name__)
 TRUTH_DTYPE = np.dtype(
     [
         ("time_unix_ns", "<i8"),
@@ -85,7 +88,8 @@ class StubFleetSettings:
     truth_path: Path | None = None
     """file of TRUTH_DTYPE records, appended to; None: not recorded"""
     stop_fd: int | None = None
-    """a file descriptor whose end of file means that the launcher is gone; None: nobody to watch"""
+    """a file descriptor whose end of file means that the launcher is gone; a line on it is a fault (see
+    `sim.px4.faults.encode_order`). None: nobody to watch"""
     grace_s: float = 0.0
     """after a signal or the launcher's end the vehicles stay this long, so that a landing command still arrives"""
 
@@ -250,6 +254,7 @@ def _serve(
     utc_offset_ns: int,
 ) -> None:
     vehicles = [(link.settings.vehicle_id, link.autopilot) for link in links]
+    orders = _FaultOrders(dict(vehicles))
     deadlines = [link.autopilot.next_deadline_ns() for link in links]
     truth_due_ns = boot_ns + TRUTH_INTERVAL_NS
     end_ns: int | None = None
@@ -264,9 +269,11 @@ def _serve(
             if key.data is not None:
                 links[key.data].receive_all()
                 deadlines[key.data] = links[key.data].autopilot.next_deadline_ns()
-            elif _is_over(key.fd, settings.stop_fd):
+            elif key.fd != settings.stop_fd or orders.read_until_end(key.fd):
                 if key.fd == settings.stop_fd:
                     selector.unregister(key.fd)
+                else:
+                    os.read(key.fd, 4096)
                 grace_ns = round(settings.grace_s * 1e9)
                 asked_again = end_ns is not None and key.fd != settings.stop_fd
                 end_ns = time.monotonic_ns() + (0 if asked_again else grace_ns)
@@ -284,10 +291,26 @@ def _serve(
             truth_due_ns += (late + 1) * TRUTH_INTERVAL_NS
 
 
-def _is_over(fd: int, stop_fd: int | None) -> bool:
-    """A signal came, or the launcher's end of the pipe is closed."""
-    data = os.read(fd, 4096)
-    return not data if fd == stop_fd else True
+class _FaultOrders:
+    """Lines from the launcher, each of them a fault of one vehicle."""
+
+    def __init__(self, vehicles: dict[int, Autopilot]) -> None:
+        self._vehicles = vehicles
+        self._line = b""
+
+    def read_until_end(self, fd: int) -> bool:
+        """Carries out what has come; True: the launcher has closed its end."""
+        data = os.read(fd, 4096)
+        *lines, self._line = (self._line + data).split(b"\n")
+        for line in lines:
+            try:
+                vehicle_id, fault = decode_order(line)
+                self._vehicles[vehicle_id].inject(fault)
+            except (ValueError, TypeError) as error:
+                log.warning("fault order %r refused: %s", line, error)
+            except KeyError:
+                log.warning("fault order %r refused: no such vehicle here", line)
+        return not data
 
 
 __all__ = [

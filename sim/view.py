@@ -1,10 +1,11 @@
 """What people see of a flight: the live table, the status, the summary."""
 
+from collections import Counter
 from collections.abc import Mapping
 from types import TracebackType
 from typing import Any, Self
 
-from rich.console import Console, Group
+from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
@@ -14,38 +15,75 @@ from sim.launch import Progress
 PLAIN_INTERVAL_S = 5.0
 
 
-def status_table(vehicles: Mapping[int, Mapping[str, Any] | None], rates: Mapping[int, float] | None = None) -> Table:
-    """One row a vehicle."""
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    table.add_column("vehicle", justify="right")
-    table.add_column("phase")
-    table.add_column("mode")
-    for name in ("slot error m", "neighbours", "nearest m", "messages/s", "oldest s", "late ms", "battery %"):
-        table.add_column(name, justify="right")
-    table.add_column("remarks")
-    for i, s in sorted(vehicles.items()):
+NARROW = 100
+"""columns of a terminal below which mode and battery are left out"""
+Vehicles = Mapping[int, Mapping[str, Any] | None]
+
+
+def status_table(
+    vehicles: Vehicles, rates: Mapping[int, float] | None = None, *, width: int = 120, height: int | None = None
+) -> RenderableType:
+    """One row a vehicle, never more than `height` lines; whoever is in trouble is shown first of all."""
+    narrow = width < NARROW
+    shown = vehicles if height is None or len(vehicles) + 2 <= height else _worst(vehicles, max(height - 3, 1))
+    table = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 1 if narrow else 2, 0, 0))
+    table.add_column("\nvehicle", justify="right", min_width=7)
+    table.add_column("\nphase", min_width=8)
+    if not narrow:
+        table.add_column("\nmode", min_width=12)
+    names = ["slot\nerror m", "neigh-\nbours", "nearest\nm", "messages\n/s", "oldest\ns", "late\nms"]
+    for name in names if narrow else [*names, "battery\n%"]:
+        table.add_column(name, justify="right", min_width=max(len(part) for part in name.split("\n")))
+    table.add_column("\nremarks", no_wrap=True, overflow="ellipsis")
+    for i, s in sorted(shown.items()):
         if s is None:
             table.add_row(str(i), Text("silent", style="red"))
             continue
-        remarks = [*s["failsafes"], *(s["ready"] if s["phase"] in ("idle", "landed") and not s["armed"] else [])]
-        rejected = sum(s["rejected"].values())
-        if rejected:
-            remarks.append(f"{rejected} rejected")
         style = {"formed": "green", "released": "red"}.get(s["phase"], "")
         table.add_row(
             str(i),
             Text(s["phase"], style=style),
-            s["mode"].lower(),
+            *([] if narrow else [s["mode"].lower()]),
             _number(s["position_error_m"], 2),
             str(s["neighbours"]),
             _number(s["nearest_m"], 2),
             _number(None if rates is None else rates.get(i), 2),
             _number(s["oldest_age_s"], 1),
             _number(s.get("lateness_ms"), 1),
-            _number(s["battery_percent"], 0) if s["battery_percent"] >= 0 else "-",
-            Text("; ".join(remarks), style="yellow"),
+            *([] if narrow else [_number(s["battery_percent"], 0) if s["battery_percent"] >= 0 else "-"]),
+            Text("; ".join(_remarks(s)), style="yellow"),
         )
-    return table
+    rest = {i: s for i, s in vehicles.items() if i not in shown}
+    return Group(table, Text(f"and {len(rest)} more: {_phases(rest)}")) if rest else table
+
+
+def _remarks(status: Mapping[str, Any]) -> list[str]:
+    waiting = status["phase"] in ("idle", "landed") and not status["armed"]
+    rejected = sum(status["rejected"].values())
+    return [
+        *status["failsafes"],
+        *(status["ready"] if waiting else []),
+        *([f"{rejected} rejected"] if rejected else []),
+    ]
+
+
+def _worst(vehicles: Vehicles, count: int) -> Vehicles:
+    """So many of them: the silent, those with failsafes, those behind the others, then by id."""
+    common = Counter(s["phase"] for s in vehicles.values() if s is not None).most_common(1)
+
+    def rank(item: tuple[int, Mapping[str, Any] | None]) -> tuple[int, int]:
+        i, s = item
+        if s is None:
+            return 0, i
+        return 1 if s["failsafes"] else 2 if s["phase"] != common[0][0] else 3, i
+
+    return dict(sorted(vehicles.items(), key=rank)[:count])
+
+
+def _nearest(vehicles: Vehicles) -> str:
+    """The closest pair as the vehicles believe it."""
+    distances = [s["nearest_m"] for s in vehicles.values() if s is not None and s["nearest_m"] is not None]
+    return f", nearest pair {min(distances):.2f} m" if distances else ""
 
 
 def _number(value: float | None, digits: int) -> str:
@@ -57,7 +95,9 @@ class FlightView:
 
     def __init__(self, quiet: bool) -> None:
         self._console = Console(stderr=True, quiet=quiet)
-        self._live = Live(console=self._console, refresh_per_second=4) if self._console.is_terminal else None
+        # Redrawn when there is news, and by nobody else: a thread less, and no half-drawn table.
+        on_terminal = self._console.is_terminal and not quiet
+        self._live = Live(console=self._console, auto_refresh=False) if on_terminal else None
         self._sent: dict[int, tuple[float, int]] = {}
         self._rates: dict[int, float] = {}
         self._told_s = -PLAIN_INTERVAL_S
@@ -84,17 +124,20 @@ class FlightView:
                     self._sent[i] = (progress.elapsed_s, s["messages"])
                 else:
                     self._sent.setdefault(i, (progress.elapsed_s, s["messages"]))
-        head = f"{progress.elapsed_s:6.1f} s  {progress.doing}"
+        fleet = progress.vehicles
+        head = f"{progress.elapsed_s:6.1f} s  {progress.doing}: {_phases(fleet)}{_nearest(fleet)}"
         if progress.ended:
-            head += "  ended: " + ", ".join(f"companion {i} (status {s})" for i, s in sorted(progress.ended.items()))
+            head += "; ended: " + ", ".join(f"companion {i} (status {s})" for i, s in sorted(progress.ended.items()))
         if self._live is not None:
-            self._live.update(Group(Text(head), status_table(progress.vehicles, self._rates)))
+            width, height = self._console.size
+            table = status_table(progress.vehicles, self._rates, width=width, height=height - 2)
+            self._live.update(Group(Text(head, no_wrap=True, overflow="ellipsis"), table), refresh=True)
         elif progress.elapsed_s - self._told_s >= PLAIN_INTERVAL_S or progress.doing != self._doing:
             self._told_s, self._doing = progress.elapsed_s, progress.doing
-            self._console.print(f"{head}: {_phases(progress.vehicles)}", highlight=False)
+            self._console.print(head, highlight=False, soft_wrap=True)
 
 
-def _phases(vehicles: Mapping[int, Mapping[str, Any] | None]) -> str:
+def _phases(vehicles: Vehicles) -> str:
     counts: dict[str, int] = {}
     for s in vehicles.values():
         name = "silent" if s is None else s["phase"]
@@ -102,9 +145,10 @@ def _phases(vehicles: Mapping[int, Mapping[str, Any] | None]) -> str:
     return ", ".join(f"{n} {name}" for name, n in counts.items())
 
 
-def show_status(vehicles: Mapping[int, Mapping[str, Any] | None]) -> None:
+def show_status(vehicles: Vehicles) -> None:
     """The status of a fleet, once."""
-    Console().print(status_table(vehicles))
+    console = Console()
+    console.print(status_table(vehicles, width=console.width))
 
 
 def show_summary(summary: Mapping[str, Any]) -> None:
@@ -151,4 +195,4 @@ def _unit(value: Any, unit: str) -> str:
 
 
 def _pair(p: Mapping[str, Any]) -> str:
-    return f"{p['p50']}, {p['p99']} ms"
+    return "-" if p["p50"] is None else f"{p['p50']}, {p['p99']} ms"

@@ -180,11 +180,15 @@ class PeerTable:
         return max(ages) * 1e-9 if ages else None
 
     def silent_for_s(self, now: Instant) -> float | None:
-        """How long nobody has been heard or present; None if nobody ever was (s)."""
-        if any(p.present and p.lost_at_ns is None for p in self._peers.values()):
-            return 0.0
-        ends = [p.lost_at_ns for p in self._peers.values() if p.lost_at_ns is not None]
-        return (now.fleet_ns - max(ends)) * 1e-9 if ends else None
+        """How long everybody has been lost: gone, or silent for longer than a peer may be; None if nobody ever was heard
+        (s)."""
+        allowed_ns = round(self.limits.stale_after_s * 1e9)
+        ends = [
+            p.sample.time_ns + allowed_ns if p.lost_at_ns is None else p.lost_at_ns
+            for p in self._peers.values()
+            if p.sample is not None
+        ]
+        return max(now.fleet_ns - max(ends), 0) * 1e-9 if ends else None
 
     def digest(self) -> tuple[PeerSample, ...]:
         """The latest samples of peers for passing on, newest first."""

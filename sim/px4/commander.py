@@ -69,8 +69,6 @@ class Commander:
         """somebody holds sticks"""
         self.killed = False
         self.battery_fraction = 1.0
-        self.ever_flown = False
-        """has left the ground since it was armed"""
         self._restored_mode = Mode.LOITER
         self._armed_at_ns = 0
         self._killed_at_ns = 0
@@ -147,7 +145,6 @@ class Commander:
         if not (self.may_arm(now_ns) or (force and self.ready(now_ns))):
             return Result.TEMPORARILY_REJECTED
         self.armed = True
-        self.ever_flown = False
         self._armed_at_ns = now_ns
         self._landed_at_ns = None
         self.on_home_moved()
@@ -279,7 +276,7 @@ class Commander:
         limit_m_s = self._parameters.number("MPC_Z_VEL_MAX_UP")
         if self.takeoff_state is not TakeoffState.RAMPUP:
             return limit_m_s
-        start = -GRAVITY_M_S2 / self._parameters.number("MPC_Z_VEL_P_ACC")
+        start = -GRAVITY_M_S2 / max(self._parameters.number("MPC_Z_VEL_P_ACC"), 0.1)
         return start + (limit_m_s - start) * min(self._ramp_progress(now_ns), 1.0)
 
     def _step_landed(self, now_ns: int) -> None:
@@ -313,7 +310,6 @@ class Commander:
 
     def _lift_off(self) -> None:
         self.landed_state = LandedState.IN_AIR
-        self.ever_flown = True
         self._contact_ns = None
         self._landed_at_ns = None
         self.on_home_moved()

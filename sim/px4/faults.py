@@ -1,5 +1,6 @@
 """Faults that a test or an operator orders from the stand-in autopilot. Values only; the autopilot carries them out."""
 
+import json
 import math
 from dataclasses import dataclass
 from enum import StrEnum
@@ -76,3 +77,42 @@ class Fault:
     def strength(self) -> float:
         """The magnitude, or the kind's default."""
         return DEFAULT_MAGNITUDE.get(self.kind, 0.0) if self.magnitude is None else self.magnitude
+
+
+def encode_order(vehicle_id: int, fault: Fault) -> bytes:
+    """One line that orders a fault from the host of the stand-ins; see `decode_order`."""
+    order: dict[str, object] = {
+        "vehicle": vehicle_id,
+        "kind": fault.kind.value,
+        "offset_ned_m": list(fault.offset_ned_m),
+    }
+    if fault.magnitude is not None:
+        order["magnitude"] = fault.magnitude
+    if math.isfinite(fault.duration_s):
+        order["duration_s"] = fault.duration_s
+    return json.dumps(order).encode() + b"\n"
+
+
+def decode_order(line: bytes) -> tuple[int, Fault]:
+    """Vehicle and fault of a line `{"vehicle": 3, "kind": "gps_lost", "magnitude": 0.3, "duration_s": 8}`.
+
+    Only vehicle and kind are needed. Raises ValueError that says what came and what is allowed.
+    """
+    order = json.loads(line)
+    if not isinstance(order, dict):
+        raise ValueError(f"a fault is ordered by a JSON object, got {order!r}")
+    allowed = {"vehicle", "kind", "magnitude", "duration_s", "offset_ned_m"}
+    if unknown := set(order) - allowed:
+        raise ValueError(f"unknown keys {sorted(unknown)}, allowed are {sorted(allowed)}")
+    vehicle_id, kind = order.get("vehicle"), order.get("kind")
+    if not isinstance(vehicle_id, int):
+        raise ValueError(f"vehicle must be a whole number, got {vehicle_id!r}")
+    if kind not in set(FaultKind):
+        raise ValueError(f"kind must be one of {', '.join(FaultKind)}, got {kind!r}")
+    magnitude = order.get("magnitude")
+    return vehicle_id, Fault(
+        FaultKind(kind),
+        None if magnitude is None else float(magnitude),
+        float(order.get("duration_s", math.inf)),
+        Ned(*(float(value) for value in order.get("offset_ned_m", DEFAULT_OFFSET_NED_M))),
+    )

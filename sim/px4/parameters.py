@@ -153,6 +153,8 @@ class ParameterTable:
         value: float | int
         if wire_type == TYPE_INT32:
             value = int(struct.unpack("<i", struct.pack("<f", wire_value))[0])
+        elif not math.isfinite(wire_value):
+            return None
         else:
             value = _as_float32(wire_value)
         if value == self._values[name]:

@@ -12,6 +12,7 @@ from pymavlink.dialects.v20 import development as mavlink
 from stub_process import fleet, launched, listening, running, wait_until_bound
 
 from companion.errors import CompanionError
+from sim.px4.faults import Fault, FaultKind, encode_order
 from sim.stubs import TRUTH_DTYPE, run_stubs
 
 pytestmark = pytest.mark.process
@@ -70,6 +71,21 @@ def test_ctrl_c_ends_the_stubs_cleanly_after_the_grace() -> None:
         process.join(5.0)
         assert process.exitcode == 0
         assert 0.45 <= time.monotonic() - asked_s < 2.5
+
+
+def test_launcher_orders_a_fault_through_its_pipe() -> None:
+    settings = fleet(2)
+    with listening(settings.vehicles[1].companion_port) as companion, launched(settings) as process:
+        assert process.stdin is not None
+        assert receive(companion)
+        process.stdin.write(b"nonsense\n" + encode_order(2, Fault(FaultKind.LOW_BATTERY, magnitude=0.2)))
+        process.stdin.flush()
+        end_s = time.monotonic() + 10.0
+        while time.monotonic() < end_s:
+            reports = [m for m in receive(companion) if m.get_type() == "SYS_STATUS"]
+            if reports and reports[0].battery_remaining == 20:
+                return
+        raise AssertionError("the fault was not carried out")
 
 
 def test_launchers_end_is_noticed_by_its_pipe() -> None:

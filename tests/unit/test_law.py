@@ -24,7 +24,7 @@ from companion.core.law import (
     within_budget,
 )
 
-PROPERTY = settings(deadline=None, max_examples=80)
+PROPERTY = settings(deadline=None, max_examples=40)
 FLIGHT = Gains(3.0, 3.0, 4.0, 1.0, 0.3, 2.0, 5.0, 1.0, 1.0, 1.0)
 Vector = npt.NDArray[np.float64]
 
@@ -50,7 +50,7 @@ class Scene:
 
 
 @st.composite
-def scenes(draw: st.DrawFn, least: int = 0, most: int = 9) -> Scene:
+def scenes(draw: st.DrawFn, least: int = 0, most: int = 6) -> Scene:
     n = 1 + draw(st.integers(least, most))
     rows = st.lists(vectors(8.0), min_size=n, max_size=n).map(np.array)
     return Scene(

@@ -29,7 +29,7 @@ from companion.core.safety import (
 )
 from companion.core.values import Command, Neighbour, SafeSetpoint, VehicleState
 
-PROPERTY = settings(deadline=None, max_examples=100)
+PROPERTY = settings(deadline=None, max_examples=60)
 ZERO = Ned(0.0, 0.0, 0.0)
 DT_S = 0.02
 LIMITS = SafetyLimits(
@@ -91,7 +91,7 @@ def by_active_sets(u: tuple[float, float], planes: Sequence[HalfPlane]) -> tuple
     return min((x for x in points if missed(x, planes) <= 1e-7), key=lambda x: dist(x, u), default=None)
 
 
-@settings(deadline=None, max_examples=500)
+@settings(deadline=None, max_examples=300)
 @given(commands_2d, st.lists(planes_of, max_size=9))
 def test_nearest_feasible_agrees_with_all_active_sets(u: tuple[float, float], planes: list[HalfPlane]) -> None:
     north, east, met = nearest_feasible(*u, planes)
@@ -333,7 +333,7 @@ anything = st.one_of(st.floats(), st.floats(-10.0, 10.0), st.sampled_from([nan, 
 any_vector = st.builds(Ned, anything, anything, anything)
 
 
-@settings(deadline=None, max_examples=400)
+@settings(deadline=None, max_examples=150)
 @given(
     st.builds(Command, any_vector, any_vector, any_vector, any_vector, anything),
     st.builds(VehicleState, st.just(0), any_vector, any_vector),
@@ -702,7 +702,7 @@ def test_a_column_of_followers_passes_it_one_after_the_other(barrier: bool) -> N
             assert f.position == pytest.approx([45.0 - 3.0 * k, 0.0, -10.0], abs=0.3)
 
 
-@pytest.mark.parametrize(("count", "seed"), [(3, 0), (5, 1), (8, 2)])
+@pytest.mark.parametrize(("count", "seed"), [(3, 0), (6, 1)])
 def test_vehicles_that_change_places_across_a_circle_arrive(count: int, seed: int) -> None:
     """All want through the middle at once, some centimetres off a perfect symmetry, which would stop them for ever."""
     rng = random.Random(seed)
@@ -712,7 +712,7 @@ def test_vehicles_that_change_places_across_a_circle_arrive(count: int, seed: in
         place = np.array([6.0 * cos(angle) + rng.gauss(0, 0.05), 6.0 * sin(angle) + rng.gauss(0, 0.05), 0.0])
         flyers.append(Flyer(place, np.zeros(3), toward(resting(*-place), 1.0), SafetyFilter(LIMITS)))
     targets = [-f.position for f in flyers]
-    assert fly(flyers, 40.0) >= 0.98
+    assert fly(flyers, 30.0) >= 0.98
     assert max(float(np.linalg.norm(f.position - x)) for f, x in zip(flyers, targets, strict=True)) < 0.2
 
 

@@ -6,7 +6,7 @@ import pytest
 from autopilot_flight import ORIGIN, Flight, mavlink
 
 from companion.core.frames import Geodetic, Ned, geodetic_to_ned
-from sim.px4.faults import Fault, FaultKind
+from sim.px4.faults import Fault, FaultKind, decode_order, encode_order
 from sim.px4.modes import Mode
 
 
@@ -199,6 +199,33 @@ def test_fault_of_no_duration_ends_one_that_lasts() -> None:
     since_s = flight.now_s
     flight.stream(flight.setpoint(), 0.5)
     assert flight.of("LOCAL_POSITION_NED", since_s)
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        Fault(FaultKind.MUTE),
+        Fault(FaultKind.GPS_LOST, 0.2, 8.0),
+        Fault(FaultKind.ESTIMATOR_RESET, offset_ned_m=Ned(1.0, 2.0, -0.5)),
+    ],
+)
+def test_order_of_a_fault_survives_its_line(fault: Fault) -> None:
+    assert decode_order(encode_order(7, fault)) == (7, fault)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        (b"[]", "JSON object"),
+        (b'{"vehicle": 1, "kind": "sulk"}', "kind must be one of gps_lost, .*, got 'sulk'"),
+        (b'{"vehicle": "1", "kind": "mute"}', "vehicle must be a whole number, got '1'"),
+        (b'{"vehicle": 1, "kind": "mute", "for": 3}', r"unknown keys \['for'\]"),
+        (b"nonsense", "Expecting value"),
+    ],
+)
+def test_order_that_cannot_be_understood_is_refused(line: bytes, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        decode_order(line)
 
 
 def test_faults_out_of_range_are_refused() -> None:

@@ -307,7 +307,7 @@ def test_reported_velocity_answers_a_step_as_the_recorded_one_did(name: str) -> 
     flight.stream(flight.setpoint(), 3.0)
     value = float(name.split()[2]) if len(name.split()) > 2 else 20.0
     if name.startswith("acc"):
-        step = flight.setpoint(0x81B, z=-10.0, afx=value)
+        step = flight.setpoint(0x83B, z=-10.0, afx=value)
     else:
         step = flight.setpoint(vx=value)
     begin_s = flight.now_s

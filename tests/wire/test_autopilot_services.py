@@ -161,6 +161,27 @@ def test_system_id_parameter_acts_after_a_reboot(flight: Flight) -> None:
     assert flight.last("HEARTBEAT").get_srcSystem() == 42
 
 
+@pytest.mark.parametrize("value", [0.0, -3.0, 1e30])
+def test_no_value_of_a_parameter_stops_the_autopilot(value: float) -> None:
+    flight = Flight()
+    flight.take_off()
+    flight.go_offboard()
+    for name, default in DEFAULTS.items():
+        if isinstance(default, float):
+            write(flight, name, value, REAL32)
+            flight.stream(flight.setpoint(vx=1.0, vz=-0.2), 0.1)
+            flight.set_mode(Mode.LOITER)
+            flight.run(0.1)
+            write(flight, name, default, REAL32)
+            flight.go_offboard()
+    assert flight.last("HEARTBEAT")
+
+
+def test_parameter_that_is_no_number_is_refused(flight: Flight) -> None:
+    assert write(flight, "COM_OF_LOSS_T", float("nan"), REAL32) == []
+    assert write(flight, "COM_OF_LOSS_T", float("inf"), REAL32) == []
+
+
 # Missions, files, time
 
 

@@ -1,0 +1,341 @@
+"""Flights in which something fails: a companion, the network, a pilot's patience."""
+
+import json
+from collections.abc import Iterable
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from flights import (
+    check_setpoint,
+    distances,
+    errors,
+    failsafes,
+    first,
+    fleet,
+    last,
+    launch,
+    straight,
+    truth,
+    until,
+    until_formed,
+    until_landed,
+    wait,
+)
+
+from companion.config import FleetConfig
+from companion.core.frames import Ned
+from companion.core.plan import VelocityLeg, with_legs
+from companion.core.values import Instant, Phase
+from companion.operate import Operator, turn_leg, velocity_leg
+from companion.wire.mavlink import Px4Mode
+from companion.wire.peer import encode_motion
+from sim.lockstep import Lockstep
+from sim.network import NetworkParameters
+from sim.px4.faults import Fault, FaultKind
+
+CLEARANCE_M = 1.2
+
+
+def leader(ls: Lockstep) -> int:
+    """The vehicle in the foremost slot: the others fly over its place."""
+    slots = ls.vehicles[1].agent.programme.newest.slots
+    return max(slots, key=lambda i: slots[i].after.north)
+
+
+def held(ls: Lockstep) -> set[bytes]:
+    return {encode_motion(v.agent.programme.newest) for v in ls.vehicles.values() if v.alive}
+
+
+# -- a companion is killed -------------------------------------------------------------------------------------------
+
+
+class Killed:
+    """A flight at 1 m/s whose foremost companion is killed."""
+
+    def __init__(self, shape: str, altitude_m: float, plan_s: float) -> None:
+        config = fleet(5, altitude_m=altitude_m, shape=shape, legs=straight(plan_s))
+        self.ls = launch(config, seed=2)
+        until_formed(self.ls)
+        wait(self.ls, 8.0)
+        self.killed = leader(self.ls)
+        self.killed_s = self.ls.now_ns * 1e-9
+        self.ls.kill(self.killed)
+        self.others = [i for i in self.ls.vehicles if i != self.killed]
+        until_landed(self.ls, 90.0)
+
+
+@cache
+def flown(shape: str) -> Killed:
+    return Killed(shape, *{"v": (3.0, 20.0), "column": (6.0, 24.0)}[shape])
+
+
+@pytest.fixture(params=["v", "column"])
+def killed(request: pytest.FixtureRequest) -> Killed:
+    """Each flown once, in whatever order the tests come."""
+    return flown(request.param)
+
+
+def test_the_lost_vehicles_own_autopilot_lands_it(killed: Killed) -> None:
+    t = truth(killed.ls, killed.killed_s)
+    k = t.column(killed.killed)
+    assert Px4Mode.AUTO_LAND in t.mode[:, k]
+    assert not t.armed[-1, k]
+    assert abs(t.position_ned_m[-1, k, 2]) < 0.3
+
+
+def test_the_others_keep_apart_from_each_other_and_from_the_lost_one(killed: Killed) -> None:
+    t = truth(killed.ls, killed.killed_s)
+    assert distances(t, killed.others).min() >= CLEARANCE_M
+    k = t.column(killed.killed)
+    aloft = t.position_ned_m[:, k, 2] < -1.0
+    assert aloft.any()
+    p = t.position_ned_m[aloft]
+    gaps = [np.linalg.norm(p[:, t.column(i)] - p[:, k], axis=1).min() for i in killed.others]
+    assert min(gaps) >= CLEARANCE_M
+
+
+def test_the_others_find_their_formation_again_and_land(killed: Killed) -> None:
+    ls = killed.ls
+    landing_s = min(first(ls, "formed -> landing", i) for i in killed.others)
+    t = truth(ls, landing_s - 4.0, landing_s)
+    formation, _ = errors(ls, t, killed.others)
+    assert np.sqrt(np.square(formation).mean()) <= 0.2
+    assert {ls.phases()[i] for i in killed.others} == {Phase.LANDED}
+    assert failsafes(ls) == []
+
+
+def test_a_companion_that_starts_anew_is_told_the_plan_and_disturbs_nobody(killed: Killed) -> None:
+    ls = killed.ls
+    ls.restart(killed.killed)
+    agent = ls.vehicles[killed.killed].agent
+    assert agent.programme.newest.revision == 0
+    wait(ls, 3.0)
+    assert len(held(ls)) == 1
+    assert agent.programme.newest.revision > 1
+    assert agent.phase is Phase.IDLE
+    assert all(ls.vehicles[i].agent.peers.phases()[killed.killed] is Phase.IDLE for i in killed.others)
+
+
+# -- a pilot takes over, the rest are cut off ------------------------------------------------------------------------
+
+
+class TakenOver:
+    """Three vehicles: the pilot takes one, later the other two lose each other."""
+
+    def __init__(self) -> None:
+        def brief(tables: dict[str, Any]) -> None:
+            tables["trigger"]["t_max_s"] = 2.0
+            tables["peers"]["isolated_flight_s"] = 3.0
+
+        self.setpoints: dict[int, list[float]] = {1: [], 2: [], 3: []}
+        config = fleet(3, legs=straight(60.0), change=brief)
+        self.ls = launch(config, seed=4, record=self.record)
+        until_formed(self.ls)
+        wait(self.ls, 4.0)
+        self.taken_s = self.ls.now_ns * 1e-9
+        self.ls.vehicles[2].autopilot.inject(Fault(FaultKind.PILOT_TAKEOVER))
+        wait(self.ls, 3.0)
+        self.answers = {i: json.loads(a) for i, a in self.ls.command(b'{"verb":"takeoff"}').items()}
+        self.land_answer = json.loads(self.ls.vehicles[2].agent.receive_command(b'{"verb":"land"}', self.ls.now))
+        wait(self.ls, 5.0)
+        self.cut_s = self.ls.now_ns * 1e-9
+        self.ls.partition({1}, {2}, {3})
+        until(self.ls, 40.0, lambda: {self.ls.phases()[i] for i in (1, 3)} == {Phase.LANDED})
+
+    def record(self, i: int, channel: str, now: Instant, body: bytes) -> None:
+        if channel == "output/mavlink" and body[7:10] == b"\x54\x00\x00":
+            self.setpoints[i].append(now.monotonic_ns * 1e-9)
+
+
+@pytest.fixture(scope="module")
+def taken() -> TakenOver:
+    return TakenOver()
+
+
+def test_after_the_pilots_takeover_the_stream_stops_at_once_and_for_good(taken: TakenOver) -> None:
+    assert taken.setpoints[2][-1] <= taken.taken_s + 0.2
+    assert taken.ls.vehicles[2].agent.phase is Phase.RELEASED
+    t = truth(taken.ls, taken.taken_s + 0.1)
+    assert set(t.mode[:, t.column(2)].tolist()) == {int(Px4Mode.POSCTL)}
+
+
+def test_nothing_but_heartbeats_is_said_to_an_autopilot_that_the_pilot_has(taken: TakenOver) -> None:
+    # What the companion asked for before is withdrawn too: the mode stays the pilot's, and commands are refused.
+    assert taken.answers[2]["reason"] == "the pilot has the vehicle"
+    assert taken.land_answer["accepted"] is False
+    assert [note for i, note in failsafes(taken.ls) if i == 2] == ["failsafe: autopilot left our control: POSCTL"]
+
+
+def test_the_others_hold_their_formation_without_the_one_that_was_taken(taken: TakenOver) -> None:
+    t = truth(taken.ls, taken.taken_s, taken.cut_s)
+    assert distances(t).min() >= CLEARANCE_M
+    formation, _ = errors(taken.ls, t, [1, 3])
+    assert np.sqrt(np.square(formation).mean()) <= 0.2
+
+
+def test_a_vehicle_that_hears_nobody_lands_though_they_are_still_said_to_be_there(taken: TakenOver) -> None:
+    for i in (1, 3):
+        assert first(taken.ls, "all peers lost", i) <= taken.cut_s + 1.2 * 2.0 + 3.0 + 0.5
+    assert distances(truth(taken.ls, taken.cut_s)).min() >= CLEARANCE_M
+
+
+# -- the network is bad, and falls apart -----------------------------------------------------------------------------
+
+
+class BadNetwork:
+    """Four vehicles with 30 % loss and 100 ms of delay; for a while two and two do not hear each other."""
+
+    def __init__(self) -> None:
+        def brief(tables: dict[str, Any]) -> None:
+            tables["trigger"]["t_max_s"] = 4.0
+
+            tables["plan"]["then"] = "stay"
+
+        self.config = fleet(4, change=brief)
+        self.ls = ls = launch(self.config, seed=5, network=NetworkParameters(delay_s=0.1, jitter_s=0.02, loss=0.3))
+        until_formed(ls)
+        # Two operators at once, each heard by one vehicle.
+        now = ls.vehicles[1].agent.programme.newest
+        self.orders = []
+        for k, i in enumerate((1, 4)):
+            leg = VelocityLeg(Ned(1.0, 0.1 * k, 0.0), 0.0)
+            motion = with_legs(now, at_ns=ls.now.fleet_ns + 2_000_000_000 + k, issuer=0, legs=(leg,))
+            self.orders.append(motion.order)
+            command = json.dumps({"verb": "motion", "motion": json.loads(encode_motion(motion))}).encode()
+            assert json.loads(ls.vehicles[i].agent.receive_command(command, ls.now))["accepted"]
+        wait(ls, 3.0)
+        self.agreed = {v.agent.programme.newest.order for v in ls.vehicles.values()}
+        wait(ls, 5.0)
+        self.cut_s = ls.now_ns * 1e-9
+        ls.partition({1, 2}, {3, 4})
+        wait(ls, 8.0)
+        self.healed_s = ls.now_ns * 1e-9
+        ls.partition()
+        wait(ls, 8.0)
+        self.end_s = ls.now_ns * 1e-9
+        ls.command(b'{"verb":"land"}')
+        until_landed(ls)
+
+
+@pytest.fixture(scope="module")
+def bad() -> BadNetwork:
+    return BadNetwork()
+
+
+def test_motions_that_cross_each_other_end_in_the_larger_everywhere(bad: BadNetwork) -> None:
+    assert bad.agreed == {max(bad.orders)}
+    assert len(held(bad.ls)) == 1
+
+
+def test_under_loss_and_delay_the_formation_stands_and_nobody_comes_close(bad: BadNetwork) -> None:
+    t = truth(bad.ls, last(bad.ls, "-> formed") + 3.0, bad.cut_s)
+    formation, centroid = errors(bad.ls, t, t.ids)
+    assert np.sqrt(np.square(formation).mean()) <= 0.2
+    assert np.sqrt(np.square(centroid).mean()) <= 0.5
+    assert distances(truth(bad.ls, 3.0)).min() >= CLEARANCE_M
+
+
+def test_two_halves_that_do_not_hear_each_other_fly_on_and_are_one_formation_afterwards(bad: BadNetwork) -> None:
+    ls = bad.ls
+    t = truth(ls, bad.healed_s + 5.0, bad.end_s)
+    formation, _ = errors(ls, t, t.ids)
+    assert len(t.times_ns) > 100
+    assert np.sqrt(np.square(formation).mean()) <= 0.2
+    assert failsafes(ls) == []
+
+
+# -- the operator ----------------------------------------------------------------------------------------------------
+
+
+class InLockstep:
+    """The operator's link into a fleet in lockstep."""
+
+    def __init__(self, ls: Lockstep) -> None:
+        self.ls = ls
+
+    def ask(
+        self, vehicle_ids: Iterable[int], kind: str, payload: bytes, timeout_s: float, retry_s: float
+    ) -> dict[int, bytes | None]:
+        if kind == "command":
+            answers = self.ls.command(payload)
+        else:
+            answers = {
+                i: json.dumps(v.agent.status(self.ls.now)).encode() for i, v in self.ls.vehicles.items() if v.alive
+            }
+        return {i: answers.get(i) for i in vehicle_ids}
+
+
+class Operated:
+    """Four vehicles that turn for ever and change their formation meanwhile, then stop, go somewhere and land."""
+
+    def __init__(self) -> None:
+        def change(tables: dict[str, Any]) -> None:
+            tables["plan"].update(heading="track", then="stay")
+
+        self.config: FleetConfig = fleet(4, change=change)
+        self.marks: dict[str, float] = {}
+        self.setpoints = 0
+        self.ls = launch(self.config, seed=6, record=self.record)
+        self.operator = Operator(self.config, InLockstep(self.ls))
+        until_formed(self.ls)
+        fleet_ns = self.ls.now.fleet_ns
+        assert self.operator.move(velocity_leg(1.0, 0.0, 0.0), fleet_ns).all_accepted
+        wait(self.ls, 6.0)
+        self.act("turn")
+        assert self.operator.move(turn_leg(10.0, None), self.ls.now.fleet_ns).all_accepted
+        wait(self.ls, 6.0)
+        self.act("form")
+        assert self.operator.form("line", self.ls.now.fleet_ns).all_accepted
+        wait(self.ls, 14.0)
+        self.act("hold")
+        assert self.operator.hold(self.ls.now.fleet_ns).all_accepted
+        wait(self.ls, 8.0)
+        self.act("land")
+        self.status = self.operator.status()
+        assert self.operator.land().all_accepted
+        until_landed(self.ls)
+
+    def act(self, name: str) -> None:
+        self.marks[name] = self.ls.now_ns * 1e-9
+
+    def record(self, i: int, channel: str, now: Instant, body: bytes) -> None:
+        if channel == "output/mavlink":
+            self.setpoints += check_setpoint(body, self.config)
+
+
+@pytest.fixture(scope="module")
+def operated() -> Operated:
+    return Operated()
+
+
+def test_the_formation_turns_with_its_course_and_changes_its_shape_in_the_turn(operated: Operated) -> None:
+    ls, marks = operated.ls, operated.marks
+    for begin, end in ((marks["turn"] + 5.0, marks["form"]), (marks["hold"] - 3.0, marks["hold"])):
+        t = truth(ls, begin, end)
+        formation, centroid = errors(ls, t, t.ids)
+        assert np.sqrt(np.square(formation).mean()) <= 0.2
+        assert np.sqrt(np.square(centroid).mean()) <= 0.5
+    assert distances(truth(ls, 3.0)).min() >= CLEARANCE_M
+    assert failsafes(ls) == []
+    assert operated.setpoints > 4 * 1000
+
+
+def test_hold_brings_the_formation_to_rest(operated: Operated) -> None:
+    t = truth(operated.ls, operated.marks["land"] - 1.0, operated.marks["land"])
+    assert np.linalg.norm(t.velocity_ned_m_s.mean(axis=(0, 1))) < 0.1
+
+
+def test_status_tells_of_every_vehicle_where_it_is_in_the_flight(operated: Operated) -> None:
+    for i, told in operated.status.items():
+        assert told is not None
+        assert (told["vehicle"], told["phase"], told["mode"], told["shape"]) == (i, "formed", "OFFBOARD", "line")
+        assert told["neighbours"] == 3
+        assert told["ready"] == []
+
+
+def test_a_motion_faster_than_the_limits_is_refused_by_every_vehicle(operated: Operated) -> None:
+    answers = operated.operator.move(velocity_leg(5.0, 0.0, 0.0), operated.ls.now.fleet_ns)
+    assert set(answers.refused) == {1, 2, 3, 4}
+    assert "more than 4 m/s" in answers.refused[1]
