@@ -185,7 +185,7 @@ class Agent:
     def receive_presence(self, vehicle_id: int, alive: bool, now: Instant) -> None:
         """A peer's process appeared or ended."""
         self.peers.presence(vehicle_id, alive, now)
-        if alive:
+        if alive and vehicle_id in self.peers.ids:
             # Whoever comes late has our last state from the cache; the plan it may lack is told again.
             self._plan_due_ns = now.monotonic_ns if self.programme.newest.revision > 0 else None
 

@@ -47,6 +47,8 @@ ALTITUDE_MIN_M = 1.0
 """no slot lower than this above the fleet origin"""
 SPACING_MARGIN_M = 0.2
 """slots stay this much farther apart than separation and barrier begin to act"""
+STALE_AFTER = 2.1
+"""a peer is stale after this many T_max without a word: one message may be lost"""
 LOOP_LATENCY_S = 0.12
 """control period, delay to a peer and t_min together, as the error bound takes them"""
 
@@ -350,7 +352,7 @@ class FleetConfig(_Table):
             hold=self.law.hold,
             hold_damping_s=self.law.hold_damping_s,
             range_m=self.peers.range_m,
-            stale_after_s=1.2 * self.trigger.t_max_s,
+            stale_after_s=STALE_AFTER * self.trigger.t_max_s,
             isolated_flight_s=self.peers.isolated_flight_s,
             uncertainty_m=self.prediction_error_m,
             digest_size=self.peers.digest,

@@ -94,8 +94,10 @@ class Operator:
         """Another formation; RefusedError if nobody says where the fleet is, ConfigError for an unknown shape."""
         slots = self.config.slots(shape)
         newest = self._formed()
+        # Slots that are still on their way to the last formation arrive there first.
+        start_ns = max(self._start_ns(newest, now_ns), newest.blend_end_ns)
         motion = with_formation(
-            newest, at_ns=self._start_ns(newest, now_ns), issuer=0, shape=shape, slots=slots,
+            newest, at_ns=start_ns, issuer=0, shape=shape, slots=slots,
             pinned=self.config.pinned, speed_m_s=self.config.limits.speed_max_m_s / 2,
         )  # fmt: skip
         return self._send(motion)

@@ -26,6 +26,10 @@ Parameters = Annotated[
     list[str] | None, typer.Option(metavar="NAME=VALUE", help="With --autopilot px4: a PX4 parameter, repeatable.")
 ]
 DEFAULT_FILE = Path("fleet.toml")
+FAULTS = (
+    "gps_lost", "position_frozen", "estimator_reset", "noise", "low_battery", "reboot", "mute", "pilot_takeover",
+    "pilot_sticks", "rc_kill", "slow_link",
+)  # fmt: skip
 
 
 def _default_file(path: Path) -> Path:
@@ -107,6 +111,12 @@ def up(
     parameter: Parameters = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of gusts, noise and estimator origins.")] = 0,
     calm: Annotated[bool, typer.Option("--calm", help="No gusts and no sensor noise.")] = False,
+    gcs: Annotated[
+        bool, typer.Option("--gcs", help="Show the stubs to a ground station on UDP 14550 and to PX4's 3D viewer.")
+    ] = False,
+    scenario: Annotated[
+        Path | None, typer.Option(help="Faults of the stubs: a TOML file with tables [[fault]].")
+    ] = None,
     out: Annotated[Path, typer.Option(help="Folder for the flight's folder.")] = Path("flights"),
     as_json: Annotated[bool, typer.Option("--json", help="Only summary.json on standard output.")] = False,
 ) -> None:
@@ -114,6 +124,7 @@ def up(
 
     Ctrl-C lands the fleet. Exit status: 0 the flight met its criteria, 1 it did not, 2 wrong usage or configuration.
     """
+    from sim.faults import load_scenario
     from sim.launch import FlightOptions, flight_folder, fly
     from sim.sitl import check_build, parse_parameters
     from sim.stub_fleet import check_stub_links
@@ -139,7 +150,12 @@ def up(
     config = parse(tables, fleet.name)
     if autopilot == "stub":
         check_stub_links(config)
-    options = FlightOptions(flight_folder(out), seed, duration, px4, tuple(parameter or ()), autopilot == "external")
+    elif gcs or scenario is not None:
+        raise ConfigError("--gcs and --scenario are for --autopilot stub: a PX4 speaks to the ground station by itself")
+    faults = () if scenario is None else load_scenario(scenario, config)
+    options = FlightOptions(
+        flight_folder(out), seed, duration, px4, tuple(parameter or ()), autopilot == "external", gcs, faults
+    )
     interrupted = _interrupts()
     with FlightView(quiet=as_json) as view:
         summary = fly(tables, options, view.show, interrupted)
@@ -164,6 +180,9 @@ def stub(
     fleet: FleetFile = DEFAULT_FILE,
     seed: Annotated[int, typer.Option(min=0, help="Seed of gusts, noise and estimator origins.")] = 0,
     truth: Annotated[Path | None, typer.Option(help="File for every vehicle's true motion at 50 Hz.")] = None,
+    gcs: Annotated[
+        bool, typer.Option("--gcs", help="Speak to a ground station on UDP 14550 and to PX4's 3D viewer too.")
+    ] = False,
     launched: Annotated[
         bool, typer.Option("--launched", help="End when standard input closes: for launchers.")
     ] = False,
@@ -184,9 +203,32 @@ def stub(
     run_stubs(
         stub_settings(
             config, seed=seed, truth_path=truth, stop_fd=sys.stdin.fileno() if launched else None,
-            grace_s=1.5 if launched else 0.0,
+            grace_s=1.3 if launched else 0.0, ground=gcs,
         )
     )  # fmt: skip
+
+
+@app.command()
+def fault(
+    vehicle: Annotated[int, typer.Argument(min=1, max=250, help="The vehicle's id.")],
+    kind: Annotated[str, typer.Argument(help=", ".join(FAULTS))],
+    magnitude: Annotated[float | None, typer.Option(min=0, help="Strength, in the fault's own unit.")] = None,
+    duration: Annotated[
+        float | None, typer.Option("--for", min=0, help="Seconds that a lasting fault lasts; 0 ends it.")
+    ] = None,
+    fleet: FleetFile = DEFAULT_FILE,
+    vehicles: Vehicles = None,
+) -> None:
+    """Have a stub autopilot of a running fleet suffer a fault; exit status 1 if it does not answer."""
+    from companion.config import parse
+    from sim.faults import order_fault
+    from sim.px4.faults import Fault, FaultKind
+
+    if kind not in FAULTS:
+        raise ConfigError(f"fault must be one of {', '.join(FAULTS)}, got {kind!r}")
+    config = parse(_tables(fleet, vehicles), fleet.name)
+    order_fault(config, vehicle, Fault(FaultKind(kind), magnitude, float("inf") if duration is None else duration))
+    typer.echo(f"vehicle {vehicle}: {kind}")
 
 
 @app.command(hidden=True)

@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 
-END_WITHIN_S = 1.8
+END_WITHIN_S = 1.6
 ABANDONED = 70
 """exit status of a process that did not finish by itself"""
 

@@ -22,6 +22,7 @@ from companion.io.loop import network_settings
 from companion.io.recorder import read_recording
 from companion.io.zenoh_peers import OperatorLink
 from companion.operate import Operator
+from sim.faults import ScheduledFault, order_fault
 from sim.reference_loop import read_reference_loop
 from sim.stubs import TRUTH_DTYPE
 from sim.summary import Flight, summarise
@@ -51,6 +52,10 @@ class FlightOptions:
     """of the SITL instances, NAME=VALUE each, beyond the launcher's own"""
     external: bool = False
     """fly autopilots that run already"""
+    ground: bool = False
+    """show the stubs to a ground station and PX4's viewer"""
+    faults: tuple[ScheduledFault, ...] = ()
+    """what the stubs suffer, and when after the take-off command"""
 
 
 @dataclass(slots=True)
@@ -182,7 +187,7 @@ def _fly(
     elif not options.external:
         processes.start(
             "autopilots", "sim", "stub", "--fleet", file, "--seed", str(options.seed), "--truth", str(truth),
-            "--launched",
+            "--launched", *(["--gcs"] if options.ground else []),
         )  # fmt: skip
     for i in ids:
         processes.start(
@@ -197,7 +202,7 @@ def _fly(
         answers = operator.take_off()
         if not answers.all_accepted:
             raise RefusedError(answers.sentence("take-off"))
-        lost = watch.fly(options.duration_s, interrupted)
+        lost = watch.fly(options.duration_s, options.faults, interrupted)
         final = watch.said
     processes.end([f"companion-{i}" for i in ids], END_TIMEOUT_S)
     processes.end([n for n in ("autopilots", "reference") if n in processes.children], AUTOPILOTS_GRACE_S)
@@ -273,9 +278,12 @@ class _Watch:
                 raise CompanionError(f"not ready after {timeout_s:.0f} s: {named}")
             time.sleep(0.3)
 
-    def fly(self, duration_s: float | None, interrupted: Callable[[], bool]) -> frozenset[int]:
+    def fly(
+        self, duration_s: float | None, faults: tuple[ScheduledFault, ...], interrupted: Callable[[], bool]
+    ) -> frozenset[int]:
         """Watch until all have landed; returns the vehicles whose companion ended before."""
         start = time.monotonic()
+        coming = list(faults)
         landing_since: float | None = None
         while True:
             answers = self._look("landing" if landing_since is not None else "flying")
@@ -290,6 +298,9 @@ class _Watch:
             done = [s["phase"] in down and not s["armed"] for s in staying]
             if staying and all(done) and len(staying) + len(lost) == len(self.ids):
                 return lost
+            while coming and time.monotonic() - start >= coming[0].at_s:
+                order_fault(self.operator.config, coming[0].vehicle_id, coming[0].fault)
+                coming.pop(0)
             over = duration_s is not None and time.monotonic() - start >= duration_s
             if landing_since is None and (over or interrupted()):
                 landing_since = time.monotonic()

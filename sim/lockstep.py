@@ -123,7 +123,9 @@ class Lockstep:
                 self._touched.update(self.vehicles)
             self._ask_deadlines()
             time_ns = min(
-                self._queue[0][0], min(self._autopilot_due_ns.values()), min(self._agent_due_ns.values(), default=end_ns)
+                self._queue[0][0],
+                min(self._autopilot_due_ns.values()),
+                min(self._agent_due_ns.values(), default=end_ns),
             )
             if time_ns > end_ns:
                 self.now_ns = end_ns

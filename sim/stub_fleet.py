@@ -28,6 +28,11 @@ def _ports(vehicle: Vehicle) -> tuple[int, int]:
     return autopilot_port(vehicle.instance, companion), companion
 
 
+def stub_port(vehicle: Vehicle) -> int:
+    """The UDP port that the vehicle's stub binds."""
+    return _ports(vehicle)[0]
+
+
 def check_stub_links(config: FleetConfig) -> None:
     """Raise ConfigError if a vehicle's link cannot be a stub's; lockstep, which has no sockets, does not mind."""
     for v in config.vehicles:
@@ -47,6 +52,7 @@ def stub_settings(
     truth_path: Path | None = None,
     stop_fd: int | None = None,
     grace_s: float = 0.0,
+    ground: bool = False,
 ) -> StubFleetSettings:
     """Settings of the stubs; each estimator's origin lies elsewhere, by up to `stub.origin_scatter_m`, after `seed`."""
     stub = config.stub
@@ -59,6 +65,7 @@ def stub_settings(
         vehicles.append(
             StubVehicleSettings(
                 vehicle_id=v.id,
+                instance=v.instance,
                 system_id=v.system_id,
                 autopilot_port=own,
                 companion_port=companion,
@@ -83,4 +90,5 @@ def stub_settings(
         truth_path=truth_path,
         stop_fd=stop_fd,
         grace_s=grace_s,
+        ground=ground,
     )  # fmt: skip

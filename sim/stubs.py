@@ -5,6 +5,7 @@ elsewhere (measured: a client on any other port gets nothing).
 """
 
 import errno
+import json
 import logging
 import math
 import os
@@ -25,6 +26,7 @@ from companion.core.frames import Geodetic, Ned
 from companion.errors import CompanionError
 from sim.autopilot import NO_OFFSET, Autopilot
 from sim.dynamics import DynamicsParameters, GustParameters, NoiseParameters
+from sim.ground import GroundLink
 from sim.px4.faults import decode_order
 
 log = logging.getLogger(__name__)
@@ -69,6 +71,8 @@ class StubVehicleSettings:
     """where its estimator's origin lies relative to home, fleet frame"""
     yaw_rad: float = 0.0
     """heading at start"""
+    instance: int = 0
+    """place in the fleet's file: its ground station's link and its viewer's port follow it"""
     booted_before_ns: int = 0
     """how much earlier than its host it booted: autopilots' streams are not in step with each other"""
     parameters: tuple[tuple[str, float | int], ...] = ()
@@ -88,10 +92,11 @@ class StubFleetSettings:
     truth_path: Path | None = None
     """file of TRUTH_DTYPE records, appended to; None: not recorded"""
     stop_fd: int | None = None
-    """a file descriptor whose end of file means that the launcher is gone; a line on it is a fault (see
-    `sim.px4.faults.encode_order`). None: nobody to watch"""
+    """a file descriptor whose end of file means that the launcher is gone; None: nobody to watch"""
     grace_s: float = 0.0
     """after a signal or the launcher's end the vehicles stay this long, so that a landing command still arrives"""
+    ground: bool = False
+    """whether the vehicles also speak to a ground station and PX4's viewer (`sim.ground`)"""
 
 
 class _TruthRecorder:
@@ -139,22 +144,43 @@ class _Link:
         self.autopilot = autopilot
         self.socket = _bind(settings)
         self.remote = ("127.0.0.1", settings.companion_port)
+        self.ground: GroundLink | None = None
 
     def receive_all(self) -> None:
         while True:
             try:
-                datagram = self.socket.recv(65535)
+                datagram, sender = self.socket.recvfrom(65535)
             except BlockingIOError:
                 return
             except ConnectionRefusedError:
                 continue  # an earlier datagram found nobody listening
-            self.autopilot.receive(datagram, time.monotonic_ns())
+            if datagram.startswith(b"{"):
+                self._carry_out(datagram, sender)
+            else:
+                self.autopilot.receive(datagram, time.monotonic_ns())
+
+    def _carry_out(self, order: bytes, sender: tuple[str, int]) -> None:
+        """A fault ordered from outside (`sim.faults`): do it, and say so."""
+        refused = None
+        try:
+            vehicle_id, fault = decode_order(order)
+            if vehicle_id != self.settings.vehicle_id:
+                raise ValueError(f"this is vehicle {self.settings.vehicle_id}, not {vehicle_id}")
+            self.autopilot.inject(fault)
+        except (ValueError, TypeError) as error:
+            refused = str(error)
+        with suppress(OSError):
+            self.socket.sendto(json.dumps({"refused": refused}).encode(), sender)
 
     def send_all(self, now_ns: int) -> None:
         for datagram in self.autopilot.advance(now_ns):
             # A full buffer or nobody listening loses the datagram, as UDP may.
             with suppress(BlockingIOError, ConnectionRefusedError):
                 self.socket.sendto(datagram, self.remote)
+            if self.ground is not None:
+                self.ground.answers(datagram)
+        if self.ground is not None:
+            self.ground.send_due(now_ns)
 
 
 def _bind(settings: StubVehicleSettings) -> socket.socket:
@@ -237,10 +263,15 @@ def run_stubs(settings: StubFleetSettings) -> None:
                 selector.register(settings.stop_fd, selectors.EVENT_READ, None)
             for index, link in enumerate(links):
                 selector.register(link.socket, selectors.EVENT_READ, index)
+                if settings.ground:
+                    link.ground = GroundLink(link.settings.instance, link.autopilot, settings.fleet_origin)
+                    selector.register(link.ground.socket, selectors.EVENT_READ, index)
             _serve(settings, links, selector, recorder, boot_ns, utc_offset_ns)
     finally:
         for link in links:
             link.socket.close()
+            if link.ground is not None:
+                link.ground.socket.close()
         if recorder is not None:
             recorder.close()
 
@@ -254,7 +285,6 @@ def _serve(
     utc_offset_ns: int,
 ) -> None:
     vehicles = [(link.settings.vehicle_id, link.autopilot) for link in links]
-    orders = _FaultOrders(dict(vehicles))
     deadlines = [link.autopilot.next_deadline_ns() for link in links]
     truth_due_ns = boot_ns + TRUTH_INTERVAL_NS
     end_ns: int | None = None
@@ -268,12 +298,12 @@ def _serve(
         for key, _ in selector.select(max(wake_ns - now_ns, 0) / 1e9):
             if key.data is not None:
                 links[key.data].receive_all()
+                if (ground := links[key.data].ground) is not None:
+                    ground.receive_all(time.monotonic_ns())
                 deadlines[key.data] = links[key.data].autopilot.next_deadline_ns()
-            elif key.fd != settings.stop_fd or orders.read_until_end(key.fd):
+            elif not os.read(key.fd, 4096) or key.fd != settings.stop_fd:
                 if key.fd == settings.stop_fd:
                     selector.unregister(key.fd)
-                else:
-                    os.read(key.fd, 4096)
                 grace_ns = round(settings.grace_s * 1e9)
                 asked_again = end_ns is not None and key.fd != settings.stop_fd
                 end_ns = time.monotonic_ns() + (0 if asked_again else grace_ns)
@@ -289,28 +319,6 @@ def _serve(
                 recorder.write(vehicles, utc_offset_ns, now_ns)
             late = (now_ns - truth_due_ns) // TRUTH_INTERVAL_NS
             truth_due_ns += (late + 1) * TRUTH_INTERVAL_NS
-
-
-class _FaultOrders:
-    """Lines from the launcher, each of them a fault of one vehicle."""
-
-    def __init__(self, vehicles: dict[int, Autopilot]) -> None:
-        self._vehicles = vehicles
-        self._line = b""
-
-    def read_until_end(self, fd: int) -> bool:
-        """Carries out what has come; True: the launcher has closed its end."""
-        data = os.read(fd, 4096)
-        *lines, self._line = (self._line + data).split(b"\n")
-        for line in lines:
-            try:
-                vehicle_id, fault = decode_order(line)
-                self._vehicles[vehicle_id].inject(fault)
-            except (ValueError, TypeError) as error:
-                log.warning("fault order %r refused: %s", line, error)
-            except KeyError:
-                log.warning("fault order %r refused: no such vehicle here", line)
-        return not data
 
 
 __all__ = [

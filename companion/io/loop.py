@@ -39,7 +39,7 @@ TRAFFIC_RECORD = struct.Struct("<q")
 """body of the "traffic" channel: bytes that this process's TCP connections have sent so far"""
 LANDING_GRACE_S = 3.0
 """how long an ending companion waits for its autopilot to confirm landing"""
-ABANDONED_GRACE_S = 1.2
+ABANDONED_GRACE_S = 1.0
 """the same when whoever launched it is gone"""
 
 

@@ -1,5 +1,6 @@
 """The host of the stand-in autopilots: ports, truth, signals, and the end of its launcher."""
 
+import json
 import os
 import signal
 import socket
@@ -73,13 +74,22 @@ def test_ctrl_c_ends_the_stubs_cleanly_after_the_grace() -> None:
         assert 0.45 <= time.monotonic() - asked_s < 2.5
 
 
-def test_launcher_orders_a_fault_through_its_pipe() -> None:
+def test_a_fault_is_ordered_by_a_datagram_and_acknowledged() -> None:
     settings = fleet(2)
-    with listening(settings.vehicles[1].companion_port) as companion, launched(settings) as process:
-        assert process.stdin is not None
+    address = ("127.0.0.1", settings.vehicles[1].autopilot_port)
+    with (
+        listening(settings.vehicles[1].companion_port) as companion,
+        launched(settings),
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as outside,
+    ):
+        outside.settimeout(5.0)
         assert receive(companion)
-        process.stdin.write(b"nonsense\n" + encode_order(2, Fault(FaultKind.LOW_BATTERY, magnitude=0.2)))
-        process.stdin.flush()
+        outside.sendto(b"{nonsense", address)
+        assert json.loads(outside.recv(4096))["refused"]
+        outside.sendto(encode_order(1, Fault(FaultKind.LOW_BATTERY)), address)
+        assert json.loads(outside.recv(4096))["refused"] == "this is vehicle 2, not 1"
+        outside.sendto(encode_order(2, Fault(FaultKind.LOW_BATTERY, magnitude=0.2)), address)
+        assert json.loads(outside.recv(4096))["refused"] is None
         end_s = time.monotonic() + 10.0
         while time.monotonic() < end_s:
             reports = [m for m in receive(companion) if m.get_type() == "SYS_STATUS"]

@@ -55,9 +55,8 @@ def test_fast_law_over_a_neighbour_list_equals_the_core_called_pair_by_pair() ->
         for j in range(n):
             if j != i and np.linalg.norm(x[i] - rows[j, :3]) <= range_m:
                 count += 1
-                sums = law.add(
-                    sums, law.pair(*(x[i] - rows[j, :3]), *(v[i] - rows[j, 3:6]), *(slot[i] - slot[j]), gains)
-                )
+                one = law.pair(*(x[i] - rows[j, :3]), *(v[i] - rows[j, 3:6]), *(slot[i] - slot[j]), gains)
+                sums = law.add(sums, one)
         expected = law.finish(count, sums, *(x[i] - slot[i]), *v[i], 0.0, 0.0, 0.0, gains)
         assert np.allclose(u[i], expected, rtol=1e-9, atol=1e-9)
 

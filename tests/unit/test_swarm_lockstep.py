@@ -18,6 +18,8 @@ FLEET = Path(__file__).resolve().parents[2] / "fleet.toml"
 COUNT = 4
 SECONDS = 6.0
 PUSH_S = 1.0
+DELAY_S = 0.02
+"""a message is heard at the control period after the one that sent it"""
 PUSH_M_S = (0.5, -0.4)
 
 
@@ -72,7 +74,8 @@ def _swarm_flight(kind: Any, start: np.ndarray, table: np.ndarray) -> Run:
         formation=Formation(shape="v", count=COUNT, along_m=3.0, across_m=3.0),
         duration_s=SECONDS, control_every=2, keep_every=1, barrier=True, barrier_radius_m=1.0, digest=3,
         k_s=law.k_s, k_a=law.k_a, k_c=law.k_c, k_v=law.k_v, k_p=law.k_p, r0_m=2.0, a_max_m_s2=law.a_max_m_s2,
-        push_agent=1, push_time_s=PUSH_S, push_m_s=(*PUSH_M_S, 0.0), trigger=kind, damping_s=law.hold_damping_s, epsilon_m=trigger.epsilon_m, gamma_s2=trigger.gamma_s2, kappa=trigger.kappa,
+        damping_s=law.hold_damping_s, trigger=kind, epsilon_m=trigger.epsilon_m, gamma_s2=trigger.gamma_s2,
+        kappa=trigger.kappa, push_agent=1, push_time_s=PUSH_S, push_m_s=(*PUSH_M_S, 0.0), delay_s=DELAY_S,
     )  # fmt: skip
     # altitude is flown by position on a real vehicle: the level plane is what is compared
     flat, level = table.copy(), start.copy()
@@ -81,7 +84,7 @@ def _swarm_flight(kind: Any, start: np.ndarray, table: np.ndarray) -> Run:
     return run(replace(setup, links=True), 0, reference=flat, start=(level[:, :3], level[:, 3:]))
 
 
-@pytest.mark.parametrize(("kind", "apart_m"), [("periodic", 0.03), ("error", 0.15)])
+@pytest.mark.parametrize(("kind", "apart_m"), [("periodic", 0.06), ("error", 0.06)])
 def test_agents_in_lockstep_and_the_compiled_swarm_recover_from_the_same_push_alike(kind: str, apart_m: float) -> None:
     times, position, start, table = _lockstep_flight(kind)
     flown = _swarm_flight(kind, start, table)
@@ -93,4 +96,4 @@ def test_agents_in_lockstep_and_the_compiled_swarm_recover_from_the_same_push_al
     apart = np.linalg.norm(ours - theirs, axis=2)
     assert apart.max() < apart_m, apart.max(axis=0)
     assert apart[:, 1].max() < 0.04, "the pushed vehicle's own path depends on the law alone"
-    assert np.linalg.norm(ours[-1] - theirs[-1], axis=1).max() < 0.03
+    assert np.linalg.norm(ours[-1] - theirs[-1], axis=1).max() < 0.05

@@ -1,0 +1,28 @@
+"""Tests that fly a real PX4 SITL: they need a build of PX4 v1.16 and its UDP ports for themselves."""
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+HERE = Path(__file__).parent
+for helpers in ("process", "wire"):
+    sys.path.insert(0, str(HERE.parent / helpers))
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what lies here, and skip it with the reason where there is no PX4."""
+    build = os.environ.get("PX4_BUILD")
+    for item in items:
+        if HERE in item.path.parents:
+            item.add_marker(pytest.mark.sitl)
+            item.add_marker(pytest.mark.timeout(400))
+            if not build:
+                item.add_marker(pytest.mark.skip(reason="PX4_BUILD names no build folder of PX4 v1.16 (docs/px4.md)"))
+
+
+@pytest.fixture(scope="session")
+def build() -> Path:
+    """PX4's build folder."""
+    return Path(os.environ["PX4_BUILD"]).resolve()
