@@ -134,6 +134,7 @@ class Agent:
         self._mode_before: int | None = None
         """custom_mode at arming, until the take-off: the vehicle may stay in it"""
         self._position_came = False
+        self._position_stale = False
         self._last_tick: Instant | None = None
         self._observed_ns: int | None = None
         """when the own state was last known"""
@@ -584,9 +585,13 @@ class Agent:
         if ap.custom_mode != Px4Mode.OFFBOARD:
             self._happened(PhaseEvent.TAKEN_OVER, now)
             return
+        if not positioned and not self._position_stale:
+            # No failsafe of ours: positions may come again before the autopilot's own acts, and if it acts, it leaves
+            # OFFBOARD, which is one.
+            self.rejected["own position stale"] += 1
+            self._outputs.notes.append("own position stale: no setpoints")
+        self._position_stale = not positioned
         if not positioned:
-            if not self.failsafes or self.failsafes[-1] != "own position stale: no setpoints":
-                self._failsafe("own position stale: no setpoints")
             return
         motion = self.programme.at(now.fleet_ns)
         if motion.then == "land" and motion.end_ns is not None and now.fleet_ns >= motion.end_ns:

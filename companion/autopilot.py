@@ -22,6 +22,8 @@ POSITION_LIMIT_S = 0.5
 LATENCY_WINDOW_NS = 1_000_000_000
 """short, since a simulated autopilot's clock may run several per cent slow: what it falls behind within the window
 counts as delay"""
+ACCURACY_LIMIT_M = 3.0
+"""PX4's own limit for arming (EKF2_REQ_EPH); flags alone stay up for seconds after the position sensor's end"""
 ESTIMATOR_FLAGS_NEEDED = 1 | 2 | 4
 """ESTIMATOR_STATUS: attitude, horizontal and vertical velocity"""
 ESTIMATOR_GLOBAL_FLAG = 16
@@ -288,4 +290,6 @@ class AutopilotClient:
         wanted |= ESTIMATOR_GLOBAL_FLAG if self.fleet_origin is not None else ESTIMATOR_RELATIVE_FLAG
         if self.estimator_flags & wanted != wanted:
             reasons.append(f"estimator not ready (flags {self.estimator_flags:#x}, needs {wanted:#x})")
+        elif not self.horizontal_accuracy_m <= ACCURACY_LIMIT_M:
+            reasons.append(f"position uncertain by {self.horizontal_accuracy_m:.1f} m, may be {ACCURACY_LIMIT_M:g} m")
         return reasons

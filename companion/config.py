@@ -11,7 +11,7 @@ import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from hashlib import blake2s
-from math import ceil, inf, radians, sqrt
+from math import ceil, hypot, inf, radians, sqrt
 from pathlib import Path
 from typing import Annotated, Any, Literal
 from urllib.parse import urlsplit
@@ -28,7 +28,7 @@ from companion.core.monitor import prediction_error_bound_m
 from companion.core.neighbours import PeerLimits
 from companion.core.plan import GotoLeg, Leg, Motion, SlotChange, TurnLeg, VelocityLeg, goto_duration_s
 from companion.core.safety import DOWNWASH_RATIO, SafetyLimits, safety_radius_m
-from companion.core.trigger import ErrorTrigger, Spacing, SwitchingTrigger, TriggerKind
+from companion.core.trigger import RAISED_MAX_M, ErrorTrigger, Spacing, SwitchingTrigger, TriggerKind
 from companion.core.values import ZERO
 from companion.errors import ConfigError
 
@@ -328,7 +328,10 @@ class FleetConfig(_Table):
     def prediction_error_m(self) -> float:
         """Bound on how far a peer that is heard may be from its prediction (m)."""
         t, limits = self.trigger, self.limits
-        epsilon = {"error": t.epsilon_m, "switching": sqrt(max(t.alpha + t.delta_min, t.delta_f))}.get(t.kind, 0.1)
+        epsilon = {
+            "error": hypot(t.epsilon_m, RAISED_MAX_M),
+            "switching": sqrt(max(t.alpha + t.delta_min, t.delta_f)),
+        }.get(t.kind, 0.1)
         return prediction_error_bound_m(
             epsilon_m=epsilon, gamma_s2=t.gamma_s2, sigma_p_m=limits.position_noise_m,
             sigma_v_m_s=limits.velocity_noise_m_s, sigma_gust_m_s2=limits.gust_m_s2,

@@ -262,7 +262,9 @@ def study(
         str,
         typer.Argument(help="example1, example2, table3, readings, pareto, faults, scale, theory, or all."),
     ],
-    seeds: Annotated[str, typer.Option(help="As in 0..19 or 0,3,5 (all: 20..39 unless said otherwise).")] = "",
+    seeds: Annotated[
+        str | None, typer.Option(help="As in 0..19 (the default) or 0,3,5; without it, all takes 20..39.")
+    ] = None,
     out: Annotated[Path, typer.Option(help="Folder for tables, figures and the report.")] = Path("studies"),
     jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     setup: Annotated[Path | None, typer.Option(help="Your own copy of the study's TOML file.")] = None,

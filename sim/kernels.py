@@ -618,6 +618,7 @@ def command(k: int, s: State, ref: Floats, o: Options, g: Gains, ig: IntentGains
         for e in range(s.start[i], s.start[i + 1]):
             j = s.column[e]
             r = e if o.links == 1 else j
+            mj = j if ref.shape[1] > 1 else 0
             if o.links == 1 and s.held_step[e] == NEVER:
                 continue
             row = s.predicted[r]
@@ -638,11 +639,14 @@ def command(k: int, s: State, ref: Floats, o: Options, g: Gains, ig: IntentGains
                 vx, vy, vz = (1.0 - share) * vx, (1.0 - share) * vy, (1.0 - share) * vz
             dx, dy, dz = own[0] - px, own[1] - py, own[2] - pz
             q = pair(
-                dx, dy, dz, own[3] - vx, own[4] - vy, own[5] - vz,
+                dx, dy, dz,
+                own[3] - vx - (ref[k, m, 3] - ref[k, mj, 3]),
+                own[4] - vy - (ref[k, m, 4] - ref[k, mj, 4]),
+                own[5] - vz - (ref[k, m, 5] - ref[k, mj, 5]),
                 s.slot[i, 0] - row[6], s.slot[i, 1] - row[7], s.slot[i, 2] - row[8], g,
             )  # fmt: skip
             outlier = gated and is_outlier(
-                vx - ref[k, m, 3], vy - ref[k, m, 4],
+                vx - ref[k, mj, 3], vy - ref[k, mj, 4],
                 s.measured[i, 0] - px - s.slot[i, 0] + row[6] - mx, s.measured[i, 1] - py - s.slot[i, 1] + row[7] - my,
             )  # fmt: skip
             # separation counts for everybody

@@ -1,6 +1,7 @@
 """A whole fleet on one machine: stubs and companions as processes, from take-off to the summary."""
 
 import json
+import os
 import subprocess
 import sys
 import time
@@ -34,6 +35,10 @@ POLL_S = 1.0
 TAKE_OFF_GRACE_S = 15.0
 """a vehicle that is still on the ground by then has given its take-off up"""
 END_TIMEOUT_S = 5.0
+CROWD = 15
+CROWD_NICENESS = 10
+"""more companions than CROWD want more than two processors: they get less, each its share, and not the one process that
+simulates all autopilots, without which nobody flies"""
 AUTOPILOTS_GRACE_S = 12.0
 LIBRARIES = ("starling-fleet", "pymavlink", "eclipse-zenoh", "numpy", "scipy", "pydantic", "mcap")
 
@@ -91,7 +96,7 @@ class FleetProcesses:
         watched = () if "sitl" in arguments else ("sim.child",)
         process = subprocess.Popen(
             [sys.executable, "-P", "-m", *watched, *arguments], stdin=subprocess.PIPE, stdout=log,
-            stderr=subprocess.STDOUT, start_new_session=True,
+            stderr=subprocess.STDOUT, process_group=0,
         )  # fmt: skip
         self.children[name] = _Child(name, process, log)
         return process
@@ -190,10 +195,13 @@ def _fly(
             "--launched", *(["--gcs"] if options.ground else []),
         )  # fmt: skip
     for i in ids:
-        processes.start(
+        process = processes.start(
             f"companion-{i}", "companion", "run", "--vehicle", str(i), "--fleet", file, "--record",
             str(folder / f"vehicle-{i}.mcap"), "--launched",
         )  # fmt: skip
+        if len(ids) > CROWD:
+            os.setpriority(os.PRIO_PROCESS, process.pid, CROWD_NICENESS)
+        _wait_imported(processes, folder, ids, lambda: show(_starting(began, ids)), interrupted)
     with OperatorLink(network_settings(config, None)) as link:
         operator = Operator(config, link)
         watch = _Watch(operator, processes, ids, show, began)
@@ -235,6 +243,29 @@ def _write(path: Path, text: str) -> None:
         path.write_text(text, encoding="utf-8")
     except OSError as error:
         raise CompanionError(f"cannot write {path}: {error.strerror}") from error
+
+
+def _starting(began: float, ids: list[int]) -> Progress:
+    return Progress(time.monotonic() - began, "starting", dict.fromkeys(ids), {})
+
+
+def _wait_imported(
+    processes: FleetProcesses, folder: Path, ids: list[int], show: Callable[[], None], interrupted: Callable[[], bool]
+) -> None:
+    """Wait until fewer companions are starting than there are processors, plus one; a recording's file says who has.
+
+    A start costs more than a second of processor time. Thirty at once would keep the autopilots from their rates, and
+    every companion from its peers, for as long as all of them take.
+    """
+    most = (os.cpu_count() or 1) + 1
+    while not interrupted():
+        begun = [i for i in ids if f"companion-{i}" in processes.children]
+        if any(processes.exit_status(f"companion-{i}") is not None for i in begun):
+            return
+        if sum(not (folder / f"vehicle-{i}.mcap").exists() for i in begun) < most:
+            return
+        show()
+        time.sleep(0.1)
 
 
 @dataclass(slots=True)

@@ -67,7 +67,7 @@ class Lockstep:
     _count: int = 0
     _autopilot_due_ns: dict[int, int] = field(default_factory=dict)
     _agent_due_ns: dict[int, int] = field(default_factory=dict)
-    """deadlines, kept until something reaches the vehicle: asking all of them at each step would cost most of the time"""
+    """deadlines, kept until something reaches the vehicle: asking all at each step would cost most of the time"""
     _touched: set[int] = field(default_factory=set)
     """vehicles whose deadlines may have changed"""
 
@@ -122,11 +122,8 @@ class Lockstep:
                 next_check_ns = self.now_ns + 100_000_000
                 self._touched.update(self.vehicles)
             self._ask_deadlines()
-            time_ns = min(
-                self._queue[0][0],
-                min(self._autopilot_due_ns.values()),
-                min(self._agent_due_ns.values(), default=end_ns),
-            )
+            agents_ns = min(self._agent_due_ns.values(), default=end_ns)
+            time_ns = min(self._queue[0][0], agents_ns, *self._autopilot_due_ns.values())
             if time_ns > end_ns:
                 self.now_ns = end_ns
                 return

@@ -180,8 +180,11 @@ class PeerTable:
         return max(ages) * 1e-9 if ages else None
 
     def silent_for_s(self, now: Instant) -> float | None:
-        """How long everybody has been lost: gone, or silent for longer than a peer may be; None if nobody ever was heard
-        (s)."""
+        """How long everybody has been lost: gone, or silent for longer than a peer may be (s).
+
+        None if nobody ever was heard. Whoever is still said to be there but says nothing counts as silent, in whatever
+        phase it was.
+        """
         allowed_ns = round(self.limits.stale_after_s * 1e9)
         ends = [
             p.sample.time_ns + allowed_ns if p.lost_at_ns is None else p.lost_at_ns

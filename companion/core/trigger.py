@@ -1,6 +1,6 @@
 """Event trigger: when the peers can no longer predict this vehicle, and must be told.
 
-error      send when |e_p|^2 + gamma |e_v|^2 >= epsilon^2 + (kappa |mean residual|)^2     (Eq. 4, threshold ours)
+error      send when |e_p|^2 + gamma |e_v|^2 >= epsilon^2 + min(kappa |residual|, 0.1 m)^2     (Eq. 4, threshold ours)
 switching  send when |e_p|^2 + gamma |e_v|^2 >= delta_i(t)                                (Eqs. 3-5 of the paper)
            delta_i = alpha e^(-beta t) + delta_min if |e_p| + |e_v| > eta, else delta_f
 periodic   send every period
@@ -10,6 +10,8 @@ all        never closer than t_min, never silent longer than T_max; e = own stat
 from math import exp, sqrt
 from typing import Literal, NamedTuple
 
+RAISED_MAX_M = 0.1
+"""the most by which residuals raise the default trigger's threshold: those of metres would blind the barrier"""
 TriggerKind = Literal["error", "switching", "periodic"]
 
 
@@ -20,16 +22,11 @@ class ErrorTrigger(NamedTuple):
     gamma_s2: float
     kappa: float
 
-    def fires(self, error_position_2: float, error_velocity_2: float, mean_residual_2: float) -> bool:
-        """Whether the squared errors (m^2, m^2/s^2) reach the threshold; the squared mean residual (m^2) raises it."""
-        return exceeds(error_position_2, error_velocity_2, mean_residual_2, self)
-
 
 def exceeds(error_position_2: float, error_velocity_2: float, mean_residual_2: float, t: ErrorTrigger) -> bool:
-    """The default trigger's inequality on plain floats (compiled for swarm studies)."""
-    return error_position_2 + t.gamma_s2 * error_velocity_2 >= (
-        t.epsilon_m * t.epsilon_m + t.kappa * t.kappa * mean_residual_2
-    )
+    """Whether the squared errors (m^2, m^2/s^2) reach the threshold; the squared mean residual (m^2) raises it."""
+    raised_2 = min(t.kappa * t.kappa * mean_residual_2, RAISED_MAX_M * RAISED_MAX_M)
+    return error_position_2 + t.gamma_s2 * error_velocity_2 >= t.epsilon_m * t.epsilon_m + raised_2
 
 
 class SwitchingTrigger(NamedTuple):

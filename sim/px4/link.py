@@ -90,6 +90,8 @@ class StreamSchedule:
         self._intervals_ns = {message: round(1e9 / rate) for message, (rate, _) in STREAMS.items()}
         self._due_ns = dict.fromkeys(STREAMS, FIRST_MESSAGE_NS)
         self.next_due_ns = FIRST_MESSAGE_NS
+        self.muted = False
+        """what falls due is left out"""
 
     def send_due(self, now_ns: int) -> None:
         """Sends what is due."""
@@ -97,7 +99,7 @@ class StreamSchedule:
         for message_id, due_ns in self._due_ns.items():
             again_ns = due_ns
             if due_ns <= now_ns:
-                message = STREAMS[message_id][1](self._telemetry)
+                message = None if self.muted else STREAMS[message_id][1](self._telemetry)
                 if message is not None:
                     self._link.send(message)
                 # A stream asked to be faster than the grid comes once a step.

@@ -29,7 +29,7 @@ JUDGED_SEEDS = "20..39"
 
 def study(
     name: str,
-    seeds: str = "",
+    seeds: str | None = None,
     out: Path = Path("study"),
     jobs: int = 1,
     setup: Path | None = None,
@@ -43,7 +43,7 @@ def study(
         raise ConfigError("--setup belongs to one study: name it instead of all")
     if jobs < 1:
         raise ConfigError(f"--jobs must be at least 1, got {jobs}")
-    chosen = parse_seeds(seeds or (JUDGED_SEEDS if name == "all" else DEFAULT_SEEDS))
+    chosen = parse_seeds((JUDGED_SEEDS if name == "all" else DEFAULT_SEEDS) if seeds is None else seeds)
     configs = [load_config(each, setup) for each in names]
     folder = writable_folder(out)
     kernels()
@@ -75,7 +75,9 @@ app = typer.Typer(add_completion=False, help="The paper's results, which reading
 @app.command()
 def command(
     name: Annotated[str, typer.Argument(help=f"one of {', '.join(STUDIES)}, or all")],
-    seeds: Annotated[str, typer.Option(help="as in 0..19 or 0,3,5; all: 20..39 unless said otherwise")] = "",
+    seeds: Annotated[
+        str | None, typer.Option(help="as in 0..19 (the default) or 0,3,5; without it, all takes 20..39")
+    ] = None,
     out: Annotated[Path, typer.Option(help="folder for tables, figures and report")] = Path("study"),
     jobs: Annotated[int, typer.Option(help="processes")] = 1,
     setup: Annotated[Path | None, typer.Option(help="your own copy of the study's TOML file")] = None,

@@ -331,4 +331,5 @@ def proportion_text(successes: int, trials: int) -> str:
     """As in "none of 20 (95 % interval 0-17 %)"."""
     low, high = proportion_interval(successes, trials)
     count = "none" if successes == 0 else str(successes)
-    return f"{count} of {trials} (95 % interval {100 * low:.2g}–{100 * high:.2g} %)"
+    ends = (f"{100 * x:.2g}" if x < 0.095 else f"{100 * x:.0f}" for x in (low, high))
+    return f"{count} of {trials} (95 % interval {'–'.join(ends)} %)"

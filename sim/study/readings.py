@@ -93,7 +93,8 @@ def finish(config: Config, pieces: Sequence[Record], seeds: Sequence[int]) -> Ou
     for k, (name, setup) in enumerate(_cases(config, "own").items()):
         flight = run(setup, seeds[0])
         axes[0, 0].plot(flight.time_s, np.linalg.norm(flight.velocity_m_s.mean(axis=1), axis=1), color=CYCLE[k],
-                        label=name.split(":")[0], ls="--" if "," in name else "-")  # fmt: skip
+                        label=name.split(":")[0], ls="--" if "V1b," in name else "-",
+                        lw=3.0 if name.startswith(("V0", "V1:")) else 1.2)  # fmt: skip
     for k, (name, setup) in enumerate(_cases(config, "holds").items()):
         flight = run(setup, seeds[0])
         axes[0, 1].plot(flight.time_s, np.linalg.norm(flight.velocity_m_s.mean(axis=1), axis=1), color=CYCLE[k],

@@ -6,6 +6,7 @@ import struct
 from math import inf, nan
 from typing import Any
 
+import pytest
 from flights import Tape, check_setpoint, fleet, launch, parse, until_formed
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -16,6 +17,9 @@ from companion.core.frames import Ned
 from companion.core.values import Instant, PeerMessage, PeerSample, Phase
 from companion.wire.peer import encode_motion, encode_state
 from sim.lockstep import UTC_AT_START_NS, Lockstep
+
+pytestmark = pytest.mark.timeout(600)
+"""a flight is simulated within a test, on whatever machine"""
 
 CONFIG = fleet(3)
 WORLD: Any = dialect.MAVLink(None, srcSystem=1, srcComponent=1)

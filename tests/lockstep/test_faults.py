@@ -35,6 +35,9 @@ from sim.lockstep import Lockstep
 from sim.network import NetworkParameters
 from sim.px4.faults import Fault, FaultKind
 
+pytestmark = pytest.mark.timeout(600)
+"""a flight is simulated within a test, on whatever machine"""
+
 CLEARANCE_M = 1.2
 
 
@@ -176,8 +179,10 @@ def test_the_others_hold_their_formation_without_the_one_that_was_taken(taken: T
 
 
 def test_a_vehicle_that_hears_nobody_lands_though_they_are_still_said_to_be_there(taken: TakenOver) -> None:
+    limits = taken.ls.config.peer_limits
     for i in (1, 3):
-        assert first(taken.ls, "all peers lost", i) <= taken.cut_s + 1.2 * 2.0 + 3.0 + 0.5
+        alone_s = first(taken.ls, "all peers lost", i) - taken.cut_s
+        assert limits.isolated_flight_s < alone_s < limits.stale_after_s + limits.isolated_flight_s + 0.5
     assert distances(truth(taken.ls, taken.cut_s)).min() >= CLEARANCE_M
 
 
@@ -189,7 +194,7 @@ class BadNetwork:
 
     def __init__(self) -> None:
         def brief(tables: dict[str, Any]) -> None:
-            tables["trigger"]["t_max_s"] = 4.0
+            tables["trigger"]["t_max_s"] = 3.0
 
             tables["plan"]["then"] = "stay"
 

@@ -32,6 +32,9 @@ from sim.lockstep import UTC_AT_START_NS, Lockstep
 from sim.network import NetworkParameters
 from sim.summary import Flight, Put, summarise
 
+pytestmark = pytest.mark.timeout(600)
+"""a flight is simulated within a test, on whatever machine"""
+
 TEN = fleet(
     10,
     legs=[

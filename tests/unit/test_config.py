@@ -254,7 +254,7 @@ def legs(*rows: dict[str, object]) -> Change:
 
 
 ACROSS = [
-    (put("formation.spacing_m", 1.5), "$.formation.spacing_m", "the safety radius 1.46 m", "got 1.50 m"),
+    (put("formation.spacing_m", 1.5), "$.formation.spacing_m", "the safety radius 1.49 m", "got 1.50 m"),
     (put("law.r0_m", 5.0), "$.formation.spacing_m", "separation's range 5.00 m", "got 4.00 m"),
     (put("formation.shape", "star"), "$.formation.shape", "v, line, column, circle, grid, spiral, sphere, custom",
      "got 'star'"),
@@ -267,7 +267,7 @@ ACROSS = [
     (put("vehicle", []), "$.vehicle", "at least 1", "got 0"),
     (nobody, "$.vehicle", "at least one vehicle must be enabled", ""),
     (put("vehicle.0.slot", 10), "$.vehicle[0].slot", "below the 10 enabled vehicles", "got 10"),
-    (put("launch.spacing_m", 1.0), "$.launch.spacing_m", "at least the safety radius 1.46 m", "got 1.00 m"),
+    (put("launch.spacing_m", 1.0), "$.launch.spacing_m", "at least the safety radius 1.49 m", "got 1.00 m"),
     (put("vehicle.0.pad_m", [-2.0, -7.5]), "$.vehicle[].pad_m", "at least the safety radius", "got"),
     (put("trigger.t_min_s", 10.0), "$.trigger.t_min_s", "below $.trigger.t_max_s = 10 s", "got 10"),
     (put(f"{VELOCITY}.north_m_s", 3.1), "$.plan.legs[0]", "<= 3 m/s (3/4 of $.limits.speed_max_m_s)", "got 3.1"),

@@ -148,6 +148,7 @@ def test_a_step_of_two_thousand_agents_costs_a_few_milliseconds() -> None:
     [
         ({"name": "example9"}, "there is no study 'example9'"),
         ({"name": "table3", "seeds": ","}, "names no seed"),
+        ({"name": "table3", "seeds": ""}, "names no seed"),
         ({"name": "table3", "seeds": "5..3"}, "names no seed"),
         ({"name": "table3", "seeds": "a..b"}, "must look like 0..19"),
         ({"name": "table3", "jobs": 0}, "--jobs must be at least 1"),

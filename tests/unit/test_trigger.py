@@ -7,7 +7,14 @@ import pytest
 
 from companion.core.hold import HoldKind, axis, weights
 from companion.core.monitor import prediction_error_bound_m
-from companion.core.trigger import ErrorTrigger, Spacing, SwitchingTrigger, switching_exceeds, switching_threshold
+from companion.core.trigger import (
+    ErrorTrigger,
+    Spacing,
+    SwitchingTrigger,
+    exceeds,
+    switching_exceeds,
+    switching_threshold,
+)
 
 TRIGGER = ErrorTrigger(epsilon_m=0.5, gamma_s2=0.25, kappa=0.5)
 SWITCHING = SwitchingTrigger(gamma_s2=0.5, alpha=0.75, beta=0.5, delta_min=0.25, delta_f=0.0625, eta=0.5)
@@ -29,13 +36,16 @@ def below(x: float) -> float:
         (0.125, 0.5, 0.0, True),  # both together reach it
         (0.125, 0.5 - 1e-12, 0.0, False),
         (0.25, 0.0, 1e-9, False),  # a residual raises the threshold
-        (0.5, 0.0, 1.0, True),
-        (below(0.5), 0.0, 1.0, False),
+        (0.2525 + 1e-12, 0.0, 0.01, True),
+        (0.2525 - 1e-12, 0.0, 0.01, False),
+        (0.26 + 1e-12, 0.0, 1.0, True),  # but by no more than 0.1 m
+        (0.26 - 1e-12, 0.0, 1.0, False),
+        (0.26 + 1e-12, 0.0, 1e6, True),
         (0.0, 0.0, 0.0, False),
     ],
 )
 def test_error_trigger_at_its_threshold(error_p2: float, error_v2: float, residual_2: float, fires: bool) -> None:
-    assert TRIGGER.fires(error_p2, error_v2, residual_2) is fires
+    assert exceeds(error_p2, error_v2, residual_2, TRIGGER) is fires
 
 
 @pytest.mark.parametrize("t_s", [0.0, 1.0, 30.0])
@@ -109,7 +119,7 @@ def fly(
         while under_way and under_way[0][0] <= k:
             received = under_way.pop(0)[1]
         q, w = held(sent, t)
-        if spacing.decide(t - sent[0] + 1e-9, spacing.t_max_s, trigger.fires((p - q) ** 2, (v - w) ** 2, 0.0)):
+        if spacing.decide(t - sent[0] + 1e-9, spacing.t_max_s, exceeds((p - q) ** 2, (v - w) ** 2, 0.0, trigger)):
             sent = (t, p, v)
             messages += 1
             under_way.append((k + delay_ticks, sent))
@@ -152,5 +162,5 @@ def test_a_silent_vehicle_still_speaks_every_t_max() -> None:
 
 def test_the_threshold_is_compared_in_metres() -> None:
     assert sqrt(TRIGGER.epsilon_m**2) == 0.5
-    assert TRIGGER.fires(0.51**2, 0.0, 0.0)
-    assert not TRIGGER.fires(0.49**2, 0.0, 0.0)
+    assert exceeds(0.51**2, 0.0, 0.0, TRIGGER)
+    assert not exceeds(0.49**2, 0.0, 0.0, TRIGGER)

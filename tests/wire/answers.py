@@ -12,6 +12,8 @@ from sim.px4.modes import Mode
 ACCEPTED, REJECTED, DENIED, UNSUPPORTED, FAILED = 0, 1, 2, 3, 4
 NOBODY = None
 NAN = math.nan
+HEARTBEAT_S = 1.2
+"""arming shows with the next heartbeat"""
 DROP = 21196
 """MAV_CMD_COMPONENT_ARM_DISARM's second parameter: at once, in the air too"""
 
@@ -77,7 +79,6 @@ ON_THE_GROUND = (
     Answer("landed", "disarm when disarmed", ARM, (0,), ACCEPTED),
     Answer("landed", "arm", ARM, (1,), ACCEPTED, armed=True),
     Answer("armed", "arm when armed", ARM, (1,), ACCEPTED),
-    Answer("armed", "disarm", ARM, (0,), ACCEPTED, armed=False),
     Answer("landed, offboard", "arm in OFFBOARD without a stream", ARM, (1,), REJECTED),
     Answer("landed", "OFFBOARD without a stream", SET_MODE, _mode(Mode.OFFBOARD), ACCEPTED, Mode.OFFBOARD),
     Answer("landed", "take-off", mavlink.MAV_CMD_NAV_TAKEOFF, TAKE_OFF, ACCEPTED, Mode.TAKEOFF),
@@ -95,6 +96,7 @@ ON_THE_GROUND = (
     Answer("landed", "arm, to another system", ARM, (1,), NOBODY, target=(2, 1)),
     Answer("landed", "arm, to another component", ARM, (1,), NOBODY, target=(1, 2)),
     Answer("landed", "arm, to any component", ARM, (1,), ACCEPTED, armed=True, target=(1, 0)),
+    Answer("armed", "disarm", ARM, (0,), ACCEPTED, armed=False),
 )  # fmt: skip
 IN_THE_AIR = (
     Answer("flying", "disarm in flight", ARM, (0,), REJECTED),
@@ -137,7 +139,7 @@ def mismatches(flyer: Flyer, row: Answer) -> list[str]:
     before = (flyer.mode, flyer.armed)
     result = flyer.command(row.command, *row.params, target=row.target)
     expected = (before[0] if row.mode is None else row.mode, before[1] if row.armed is None else row.armed)
-    flyer.run(0.3)
+    flyer.run(HEARTBEAT_S)
     found = (flyer.mode, flyer.armed)
     where = f"{row.when}: {row.what}"
     wrong = []

@@ -1,5 +1,6 @@
 """A serial line's bytes become frames, however they are cut and whatever lies between them."""
 
+from itertools import pairwise
 from typing import Any
 
 from hypothesis import given
@@ -27,7 +28,7 @@ def frames(count: int) -> list[bytes]:
 def pieces(stream: bytes, cuts: list[int]) -> list[bytes]:
     """The stream cut at those places."""
     places = sorted({0, len(stream), *(c % (len(stream) + 1) for c in cuts)})
-    return [stream[a:b] for a, b in zip(places, places[1:], strict=False)]
+    return [stream[a:b] for a, b in pairwise(places)]
 
 
 @given(st.integers(1, 20), st.lists(st.integers(0, 10_000), max_size=60))
