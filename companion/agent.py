@@ -64,6 +64,8 @@ OUR_MODES = frozenset({Px4Mode.AUTO_TAKEOFF, Px4Mode.AUTO_LOITER, Px4Mode.OFFBOA
 RESEND_NS = (250_000_000, 1_000_000_000)
 """a change of phase or motion is repeated after these delays, since one message may be lost"""
 CATCH_UP_NS = 1_000_000_000
+LOOK_PERIOD_NS = 200_000_000
+"""who does not steer looks at its peers this often: a crowd on the ground need not work as in the air"""
 FLYING = frozenset({Phase.ARMED, Phase.CLIMBING, Phase.FORMING, Phase.FORMED, Phase.LANDING})
 
 
@@ -139,6 +141,8 @@ class Agent:
         self._observed_ns: int | None = None
         """when the own state was last known"""
         self._tick: Tick | None = None
+        self._neighbours: list[Neighbour] = []
+        self._look_ns = 0
         self._sequence = 0
         self._sent: tuple[PeerSample, tuple[Ned, Ned]] | None = None
         """last sample sent, with p_ref and v_d at its time"""
@@ -391,10 +395,14 @@ class Agent:
         motion = self.programme.at(now.fleet_ns)
         moment = motion.moment(now.fleet_ns)
         reference = moment.slot(motion.slots[self.id])
-        neighbours = self.peers.predict(ego.position_ned_m, now, moment, self.phase is Phase.FORMED)
+        steers = self._steers()
+        if steers or now.monotonic_ns >= self._look_ns:
+            self._neighbours = self.peers.predict(ego.position_ned_m, now, moment, self.phase is Phase.FORMED)
+            self._look_ns = now.monotonic_ns + LOOK_PERIOD_NS
+        neighbours = self._neighbours
         residual = ZERO
         steered = False
-        if self._steers():
+        if steers:
             command, residual = self._law(ego, reference, neighbours)
             setpoint = self.safety.apply(command, ego, neighbours, bias, dt_s)
             if setpoint is not None:

@@ -183,6 +183,8 @@ class AutopilotClient:
 
     def _answer(self, event: wire.CommandAnswer, now: Instant) -> None:
         queue = self._queues.get(event.command)
+        if event.command == wire.REQUEST_MESSAGE:
+            return  # asked for again until the message itself comes
         if not queue or queue[0].tries == 0:
             self.counts["answer to nothing asked"] += 1
             return

@@ -7,7 +7,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -96,7 +96,7 @@ class FleetProcesses:
         watched = () if "sitl" in arguments else ("sim.child",)
         process = subprocess.Popen(
             [sys.executable, "-P", "-m", *watched, *arguments], stdin=subprocess.PIPE, stdout=log,
-            stderr=subprocess.STDOUT, process_group=0,
+            stderr=subprocess.STDOUT, start_new_session=True,
         )  # fmt: skip
         self.children[name] = _Child(name, process, log)
         return process
@@ -200,7 +200,7 @@ def _fly(
             str(folder / f"vehicle-{i}.mcap"), "--launched",
         )  # fmt: skip
         if len(ids) > CROWD:
-            os.setpriority(os.PRIO_PROCESS, process.pid, CROWD_NICENESS)
+            _lower_priority(process.pid)
         _wait_imported(processes, folder, ids, lambda: show(_starting(began, ids)), interrupted)
     with OperatorLink(network_settings(config, None)) as link:
         operator = Operator(config, link)
@@ -243,6 +243,13 @@ def _write(path: Path, text: str) -> None:
         path.write_text(text, encoding="utf-8")
     except OSError as error:
         raise CompanionError(f"cannot write {path}: {error.strerror}") from error
+
+
+def _lower_priority(pid: int) -> None:
+    os.setpriority(os.PRIO_PROCESS, pid, CROWD_NICENESS)
+    # Where the kernel groups processes by session, niceness counts within a group only, and each group has its own.
+    with suppress(OSError):
+        Path(f"/proc/{pid}/autogroup").write_text(str(CROWD_NICENESS))
 
 
 def _starting(began: float, ids: list[int]) -> Progress:

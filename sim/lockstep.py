@@ -122,7 +122,7 @@ class Lockstep:
                 next_check_ns = self.now_ns + 100_000_000
                 self._touched.update(self.vehicles)
             self._ask_deadlines()
-            agents_ns = min(self._agent_due_ns.values(), default=end_ns)
+            agents_ns = min(self._agent_due_ns.values(), default=end_ns + 1)
             time_ns = min(self._queue[0][0], agents_ns, *self._autopilot_due_ns.values())
             if time_ns > end_ns:
                 self.now_ns = end_ns

@@ -139,6 +139,7 @@ Event = (
 
 _READ = frozenset({0, 1, 22, 32, 49, 77, 230, 245, 436})
 ORIGIN_MESSAGE_ID = 49
+REQUEST_MESSAGE = mavlink.MAV_CMD_REQUEST_MESSAGE
 STREAMS_HZ = {32: 50.0, 436: 20.0, 245: 5.0, 230: 1.0, 1: 1.0}
 """what the companion asks for with SET_MESSAGE_INTERVAL"""
 STREAMS_OFF = (30, 31, 33, 105, 331, 111, 141, 132, 83, 85, 36, 74, 24, 87)
@@ -347,4 +348,4 @@ def interval_parameters(message_id: int, rate_hz: float) -> tuple[int, float, fl
 
 def request_message_parameters(message_id: int) -> tuple[int, float]:
     """Command and parameter of MAV_CMD_REQUEST_MESSAGE."""
-    return mavlink.MAV_CMD_REQUEST_MESSAGE, float(message_id)
+    return REQUEST_MESSAGE, float(message_id)

@@ -123,36 +123,39 @@ def test_the_pilots_vehicle_takes_commands_again_only_after_it_was_disarmed() ->
 
 def test_a_vehicle_that_somebody_else_has_armed_is_not_taken_off() -> None:
     ls = Lockstep(fleet(1))
-    ls.run_until(3.0)
+    ls.run_until(6.0)
     orders(ls, 400, 1.0)
-    ls.run_until(5.0)
+    ls.run_until(7.5)
+    assert ls.vehicles[1].autopilot.truth().armed
     answer = json.loads(ls.command(b'{"verb":"takeoff"}')[1])
     assert (answer["accepted"], answer["reason"]) == (False, "armed by somebody else")
-    ls.run_until(8.0)
+    ls.run_until(9.0)
     assert phase(ls) is Phase.IDLE
 
 
 def test_an_autopilot_that_does_not_arm_is_asked_a_few_times_and_then_left_alone() -> None:
     sent = Sent()
     ls = Lockstep(fleet(1), record=sent)
-    ls.run_until(3.0)
-    ls.vehicles[1].autopilot.inject(Fault(FaultKind.LOW_BATTERY, duration_s=25.0))
     ls.run_until(3.5)
+    # In RTL PX4 does not arm.
+    switches(ls, Px4Mode.AUTO_RTL)
+    ls.run_until(4.0)
     assert json.loads(ls.command(b'{"verb":"takeoff"}')[1])["accepted"]
     ls.run_until(20.0)
     assert phase(ls) is Phase.IDLE
     assert [note for _, note in failsafes(ls)] == ["failsafe: autopilot does not arm: take-off given up"]
-    assert sum(s > 3.5 and message_id == 76 for s, message_id in sent.rows) <= 30
+    assert sum(s > 4.0 and message_id == 76 for s, message_id in sent.rows) <= 30
     # Nobody waits for the arming any more: a pilot who arms later does not see his vehicle take off.
-    ls.run_until(30.0)
+    switches(ls, Px4Mode.AUTO_LOITER)
     orders(ls, 400, 1.0)
-    ls.run_until(33.0)
+    ls.run_until(22.0)
+    assert ls.vehicles[1].autopilot.truth().armed
     assert phase(ls) is Phase.IDLE
     assert mode(ls) != Px4Mode.AUTO_TAKEOFF
 
 
 def test_landing_right_after_the_command_to_take_off_leaves_the_vehicle_on_the_ground() -> None:
-    for delay_s in (0.0, 0.002, 0.02, 0.05, 0.1):
+    for delay_s in (0.0, 0.002, 0.05):
         ls = launch(fleet(1))
         wait(ls, delay_s)
         assert json.loads(ls.command(b'{"verb":"land"}')[1])["accepted"]
@@ -181,7 +184,6 @@ def test_a_vehicle_that_is_late_lands_when_the_others_do_not_come() -> None:
         tables["peers"]["wait_s"] = 5.0
 
     ls = launch(fleet(2, change=impatient))
-    ls.vehicles[2].autopilot.inject(Fault(FaultKind.LOW_BATTERY, duration_s=60.0))
     ls.vehicles[2].agent.receive_command(b'{"verb":"land"}', ls.now)
     until(ls, 30.0, lambda: phase(ls) is Phase.LANDING)
     assert first(ls, "waited for the others in vain", 1) - first(ls, "climbing -> forming", 1) == pytest.approx(
