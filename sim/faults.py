@@ -56,9 +56,7 @@ def load_scenario(path: Path, config: FleetConfig) -> tuple[ScheduledFault, ...]
         raise ConfigError(f"{path}: is not valid TOML: {error}") from error
     rows = tables.get("fault")
     if set(tables) != {"fault"} or not isinstance(rows, list):
-        raise ConfigError(
-            f"{path.name}: must hold tables [[fault]] alone, got {', '.join(tables) or 'none'}"
-        )
+        raise ConfigError(f"{path.name}: must hold tables [[fault]] alone, got {', '.join(tables) or 'none'}")
     found = []
     for k, row in enumerate(rows):
         where = f"{path.name}: $.fault[{k}]"

@@ -340,4 +340,3 @@ def test_step_response_stays_near_the_recorded_curve(row: dict[str, Any]) -> Non
     own = np.interp(np.arange(len(curve)) * SAMPLE_S, times_s, values)
     span = abs(row["response"]["final"] - row["response"]["start"])
     assert math.sqrt(np.mean((own - curve) ** 2)) <= max(0.08 * span, 0.08)
-
