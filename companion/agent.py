@@ -11,7 +11,7 @@ from math import dist, hypot
 from random import Random
 from typing import Any
 
-from companion.autopilot import AutopilotClient
+from companion.autopilot import POSITION_LIMIT_S, AutopilotClient
 from companion.config import FleetConfig
 from companion.core.estimate import BiasObserver, SendFilter
 from companion.core.frames import Ned
@@ -64,6 +64,8 @@ OUR_MODES = frozenset({Px4Mode.AUTO_TAKEOFF, Px4Mode.AUTO_LOITER, Px4Mode.OFFBOA
 RESEND_NS = (250_000_000, 1_000_000_000)
 """a change of phase or motion is repeated after these delays, since one message may be lost"""
 CATCH_UP_NS = 1_000_000_000
+POSITION_LOST_S = POSITION_LIMIT_S + 1.0
+"""setpoints end POSITION_LIMIT_S after the last position, and COM_OF_LOSS_T (1 s) later the autopilot acts"""
 LOOK_PERIOD_NS = 200_000_000
 """who does not steer looks at its peers this often: a crowd on the ground need not work as in the air"""
 FLYING = frozenset({Phase.ARMED, Phase.CLIMBING, Phase.FORMING, Phase.FORMED, Phase.LANDING})
@@ -232,6 +234,9 @@ class Agent:
             return None
         if self.phase is Phase.RELEASED:
             return "the pilot has the vehicle"
+        end_ns = self.programme.newest.end_ns
+        if self.programme.newest.then == "land" and end_ns is not None and now.fleet_ns >= end_ns:
+            return "the plan is over: restart the companions for another flight"
         reasons = self.unready(now)
         if reasons:
             return "; ".join(reasons)
@@ -388,6 +393,9 @@ class Agent:
         measured = self.autopilot.state(now)
         self._watch(now, measured is not None)
         if measured is None:
+            if self._resend_ns:
+                # Whoever no longer knows where it is still says so, from the last place it knew.
+                self._tell(now, ZERO, self.programme.reference(self.id, now.fleet_ns))
             return
         gap_s = 0.0 if self._observed_ns is None else (now.monotonic_ns - self._observed_ns) * 1e-9
         self._observed_ns = now.monotonic_ns
@@ -509,7 +517,8 @@ class Agent:
             self._land_seen = False
         if after is Phase.RELEASED:
             self.autopilot.cancel()
-            self._failsafe(f"autopilot left our control: {mode_name(self.autopilot.custom_mode)}")
+            if self.autopilot.custom_mode != Px4Mode.OFFBOARD:
+                self._failsafe(f"autopilot left our control: {mode_name(self.autopilot.custom_mode)}")
         self._announce(now)
 
     def _failsafe(self, reason: str) -> None:
@@ -528,6 +537,9 @@ class Agent:
                         self._take_off_wanted = False
                         ap.withdraw("arming")
                         self._failsafe("autopilot does not arm: take-off given up")
+                    elif ap.custom_mode == Px4Mode.OFFBOARD:
+                        # Left over from a flight before; without setpoints PX4 does not arm in it.
+                        ap.set_mode(Px4Mode.AUTO_LOITER)
                     else:
                         ap.ask("arming", *wire.arm_parameters(True))
             case Phase.ARMED:
@@ -600,6 +612,10 @@ class Agent:
             self._outputs.notes.append("own position stale: no setpoints")
         self._position_stale = not positioned
         if not positioned:
+            if self.autopilot.position_age_s(now) > POSITION_LOST_S:
+                # By now the autopilot's own failsafe has the vehicle, whether or not we can hear it.
+                self._failsafe("own position lost: the vehicle is left to its autopilot")
+                self._happened(PhaseEvent.TAKEN_OVER, now)
             return
         motion = self.programme.at(now.fleet_ns)
         if motion.then == "land" and motion.end_ns is not None and now.fleet_ns >= motion.end_ns:

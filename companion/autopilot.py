@@ -263,6 +263,10 @@ class AutopilotClient:
             times.append(self._next_origin_ns)
         return min(times)
 
+    def position_age_s(self, now: Instant) -> float:
+        """Age of the latest position (s); infinite before the first."""
+        return inf if self.position_ns is None else (now.monotonic_ns - self.position_ns) * 1e-9
+
     def state(self, now: Instant) -> tuple[Ned, Ned] | None:
         """Position and velocity now (fleet frame), the latest carried on by its age; None when stale."""
         if self.position_ns is None:

@@ -56,9 +56,10 @@ FLEET_PARAMETERS: Mapping[str, float | int] = {
     "SDLOG_MODE": -1,
 }
 """a fleet without RC: land when the setpoints end; no stick input; no log on disk"""
-SIMULATOR_PARAMETERS: Mapping[str, float | int] = {"EKF2_ACC_NOISE": 1.0, "EKF2_GYR_NOISE": 0.1}
+SIMULATOR_PARAMETERS: Mapping[str, float | int] = {"EKF2_ACC_NOISE": 0.6, "EKF2_GYR_NOISE": 0.1}
 """what SIH's sensors are like: in flight their white noise is 0.5, 1.7 and 1.4 m/s^2 and 0.14, 0.07 and 0.03 rad/s a
-sample, of which the estimator's defaults (0.35 and 0.015) know nothing, so that it wanders by half a metre"""
+sample, of which the estimator's defaults (0.35 and 0.015) know nothing, so that it wanders by half a metre (see
+docs/px4.md)"""
 
 
 @dataclass(frozen=True, slots=True)

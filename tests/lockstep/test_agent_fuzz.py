@@ -3,6 +3,7 @@
 import json
 import random
 import struct
+from collections.abc import Callable
 from math import inf, nan
 from typing import Any
 
@@ -62,24 +63,23 @@ class Noise:
     def mavlink(self, boot_ms: int) -> bytes:
         """A datagram with a right checksum from the right sender, with wrong contents."""
         r = self.random
-        message = r.choice(
-            [
-                # Positions of the past and of the far future come too; that is what a clock that jumps looks like.
-                lambda: dialect.MAVLink_local_position_ned_message(
-                    r.choice([boot_ms, boot_ms + 1, 0, 2**32 - 1]), *self.numbers(6)
-                ),
-                lambda: dialect.MAVLink_gps_global_origin_message(
-                    r.choice([-(2**31), 2**31 - 1, 0]), r.choice([-(2**31), 2**31 - 1, 0]), r.choice([0, 2**31 - 1]), 0
-                ),
-                lambda: dialect.MAVLink_estimator_status_message(0, r.randrange(65536), *self.numbers(8)),
-                lambda: dialect.MAVLink_command_ack_message(
-                    r.choice([22, 176, 400, 511]), r.randrange(10), 0, 0, r.choice([0, 1, 255]), r.choice([0, 191])
-                ),
-                lambda: dialect.MAVLink_extended_sys_state_message(255, 255),
-                lambda: dialect.MAVLink_param_value_message(r.randbytes(16), self.number(), r.randrange(12), 1, 0),
-                lambda: dialect.MAVLink_sys_status_message(*[2**32 - 1] * 3, 0, 0, 0, -1, 0, 0, 0, 0, 0, 0),
-            ]
-        )()
+        makers: list[Callable[[], Any]] = [
+            # Positions of the past and of the far future come too; that is what a clock that jumps looks like.
+            lambda: dialect.MAVLink_local_position_ned_message(
+                r.choice([boot_ms, boot_ms + 1, 0, 2**32 - 1]), *self.numbers(6)
+            ),
+            lambda: dialect.MAVLink_gps_global_origin_message(
+                r.choice([-(2**31), 2**31 - 1, 0]), r.choice([-(2**31), 2**31 - 1, 0]), r.choice([0, 2**31 - 1]), 0
+            ),
+            lambda: dialect.MAVLink_estimator_status_message(0, r.randrange(65536), *self.numbers(8)),
+            lambda: dialect.MAVLink_command_ack_message(
+                r.choice([22, 176, 400, 511]), r.randrange(10), 0, 0, r.choice([0, 1, 255]), r.choice([0, 191])
+            ),
+            lambda: dialect.MAVLink_extended_sys_state_message(255, 255),
+            lambda: dialect.MAVLink_param_value_message(r.randbytes(16), self.number(), r.randrange(12), 1, 0),
+            lambda: dialect.MAVLink_sys_status_message(*[2**32 - 1] * 3, 0, 0, 0, -1, 0, 0, 0, 0, 0, 0),
+        ]
+        message = r.choice(makers)()
         return bytes(message.pack(WORLD))
 
     def state(self, now: Instant) -> tuple[str, bytes]:
@@ -156,10 +156,10 @@ class Noise:
             case 5:
                 agent.receive_peer(f"fleet/{r.choice([1, 2, 3, 4, 99])}/plan", self.motion(ls), now)
             case 6:
-                key = r.choice(
+                name = r.choice(
                     ["", "state", "fleet/x/state", "fleet/1/state/plan", "fleet/1/other", "//", "fleet/1/plan"]
                 )
-                agent.receive_peer(key, r.randbytes(r.randrange(60)), now)
+                agent.receive_peer(name, r.randbytes(r.randrange(60)), now)
             case 7:
                 agent.receive_presence(r.randrange(256), r.random() < 0.9, now)
             case 8:
@@ -326,7 +326,8 @@ def test_any_order_of_events_leaves_an_agent_that_goes_on(events: list[tuple[str
             case "peer":
                 agent.receive_peer("fleet/1/state", b"\x01\x01" + value, now)
             case "presence":
-                agent.receive_presence(*value, now)
+                about, alive = value
+                agent.receive_presence(about, alive, now)
             case "command":
                 json.loads(agent.receive_command(value, now))
             case "stop":

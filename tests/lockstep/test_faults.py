@@ -344,3 +344,33 @@ def test_a_motion_faster_than_the_limits_is_refused_by_every_vehicle(operated: O
     answers = operated.operator.move(velocity_leg(5.0, 0.0, 0.0), operated.ls.now.fleet_ns)
     assert set(answers.refused) == {1, 2, 3, 4}
     assert "more than 4 m/s" in answers.refused[1]
+
+
+# -- the link to the own autopilot -----------------------------------------------------------------------------------
+
+
+def test_a_vehicle_whose_autopilot_fell_silent_is_released_and_its_peers_know_and_keep_away() -> None:
+    ls = launch(fleet(3, legs=straight(25.0)), seed=4)
+    until_formed(ls)
+    wait(ls, 6.0)
+    ls.vehicles[2].autopilot.inject(Fault(FaultKind.MUTE))
+    muted_s = ls.now_ns * 1e-9
+    until(ls, 3.0, lambda: ls.phases()[2] is Phase.RELEASED)
+    assert 1.4 <= ls.now_ns * 1e-9 - muted_s <= 2.0
+    wait(ls, 0.5)
+    for i in (1, 3):
+        assert ls.vehicles[i].agent.peers.phases()[2] is Phase.RELEASED
+    assert (2, "failsafe: own position lost: the vehicle is left to its autopilot") in failsafes(ls)
+    until(ls, 60.0, lambda: all(ls.phases()[i] is Phase.LANDED for i in (1, 3)))
+    assert not ls.vehicles[2].autopilot.truth().armed, "its autopilot landed by itself"
+    assert distances(truth(ls, muted_s)).min() > CLEARANCE_M
+
+
+def test_another_take_off_after_the_plan_has_landed_is_refused_with_the_reason() -> None:
+    ls = launch(fleet(2, legs=straight(2.0)), seed=5)
+    until_formed(ls)
+    until_landed(ls)
+    for answer in ls.command(b'{"verb":"takeoff"}').values():
+        said = json.loads(answer)
+        assert not said["accepted"]
+        assert said["reason"] == "the plan is over: restart the companions for another flight"

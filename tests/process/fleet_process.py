@@ -29,7 +29,7 @@ from sim.stubs import TRUTH_DTYPE
 
 PORTS = range(26_000, 32_000, 100)
 """clear of PX4's, of the fleets' scouting and of the ephemeral ones"""
-PATIENCE_S = 60.0
+PATIENCE_S = 120.0
 """how long a test waits for what must come; far above what it takes on an idle machine"""
 STUB_PORT_OFFSET = 40
 ALTITUDE_M = 2.0

@@ -55,7 +55,7 @@ from companion.wire.mavlink import Px4Mode, dialect
 from companion.wire.peer import encode_state
 from sim.__main__ import main as fleet_main
 
-pytestmark = pytest.mark.process
+pytestmark = [pytest.mark.process, pytest.mark.timeout(400)]
 
 FOR_EVER = "velocity:0.5:0:3600"
 ON_GROUND = 1
