@@ -265,7 +265,9 @@ def _wait_imported(
     every companion from its peers, for as long as all of them take.
     """
     most = (os.cpu_count() or 1) + 1
-    while not interrupted():
+    while True:
+        if interrupted():
+            raise CompanionError("interrupted before take-off")
         begun = [i for i in ids if f"companion-{i}" in processes.children]
         if any(processes.exit_status(f"companion-{i}") is not None for i in begun):
             return

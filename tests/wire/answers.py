@@ -92,6 +92,8 @@ ON_THE_GROUND = (
            (mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN,), ACCEPTED),
     Answer("landed", "interval of a message", mavlink.MAV_CMD_SET_MESSAGE_INTERVAL,
            (mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED, 20_000), ACCEPTED),
+    Answer("landed", "interval of a message that SITL does not have", mavlink.MAV_CMD_SET_MESSAGE_INTERVAL,
+           (mavlink.MAVLINK_MSG_ID_UTM_GLOBAL_POSITION, -1), FAILED),
     Answer("landed", "interval of an unknown message", mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, (9999, 20_000), FAILED),
     Answer("landed", "arm, to another system", ARM, (1,), NOBODY, target=(2, 1)),
     Answer("landed", "arm, to another component", ARM, (1,), NOBODY, target=(1, 2)),
