@@ -127,8 +127,8 @@ def finish(config: Config, pieces: Sequence[Record], seeds: Sequence[int]) -> Ou
         "since gaps of "
         "2.1 m between slots are narrower than two safety radii. Assigning slots by squared distance avoids this case.",
         f"There, with kappa = 0.3 as flown: {ablated['kappa = 0.3, as flown']['close']} below 0.5 m. The residual "
-        "raises the threshold by 0.1 m at most: by as much as metres of residual ask, predictions were off by more than the "
-        "safety radius, and 9 of these 20 seeds came below.",
+        "raises the threshold by 0.1 m at most: by as much as metres of residual ask, predictions were off by more than "
+        "the safety radius, and 9 of these 20 seeds came below.",
         "Messages under noise of 0.1 m and more rise above 1 %: the threshold is then near the sensors' own error.",
     ]
     fig, axes = panels(1, 2, 7.4, 5.0, sharey=True)
