@@ -126,9 +126,9 @@ def finish(config: Config, pieces: Sequence[Record], seeds: Sequence[int]) -> Ou
         f"{exchanged['flown_f_m_max']:.2f} m (worst seed){': not all get past each other' if stuck else ''}, "
         "since gaps of "
         "2.1 m between slots are narrower than two safety radii. Assigning slots by squared distance avoids this case.",
-        f"There, with kappa = 0.3 as flown: {ablated['kappa = 0.3, as flown']['close']} below 0.5 m. The residual "
-        "raises the threshold by 0.1 m at most: by as much as metres of residual ask, predictions were off by more than "
-        "the safety radius, and 9 of these 20 seeds came below.",
+        f"There, with kappa = 0.3 as flown: {ablated['kappa = 0.3, as flown']['close']} below 0.5 m. "
+        "The residual raises the threshold by 0.1 m at most: when metres of residual raised it without a bound, "
+        "predictions were off by more than the safety radius, and 9 of these 20 seeds came below.",
         "Messages under noise of 0.1 m and more rise above 1 %: the threshold is then near the sensors' own error.",
     ]
     fig, axes = panels(1, 2, 7.4, 5.0, sharey=True)
