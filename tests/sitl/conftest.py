@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from sim.sitl import check_build
+
 HERE = Path(__file__).parent
 for helpers in ("process", "wire"):
     sys.path.insert(0, str(HERE.parent / helpers))
@@ -24,5 +26,5 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session")
 def build() -> Path:
-    """PX4's build folder."""
-    return Path(os.environ["PX4_BUILD"]).resolve()
+    """PX4's build folder; what is none fails each test at once."""
+    return check_build(Path(os.environ["PX4_BUILD"]))

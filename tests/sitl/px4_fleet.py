@@ -48,9 +48,12 @@ class Flying:
     def wait(self, phase: str, *ids: int) -> None:
         """Until these vehicles (or all) are in that phase."""
         wanted = ids or tuple(self.fleet.ids)
-        wait_status(
-            self.operator, lambda said: all(i in said and said[i]["phase"] == phase for i in wanted), PATIENCE_S
-        )
+
+        def enough(said: dict[int, dict[str, Any]]) -> bool:
+            assert self.up.popen.poll() is None, self.up.err
+            return all(i in said and said[i]["phase"] == phase for i in wanted)
+
+        wait_status(self.operator, enough, PATIENCE_S)
 
     def wait_speed(self, vehicle_id: int, speed_m_s: float) -> None:
         """Until a vehicle truly flies at least so fast on the level."""
