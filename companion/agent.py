@@ -484,7 +484,7 @@ class Agent:
     def _encode(self, s: SafeSetpoint) -> bytes:
         frame = self.autopilot.frame
         assert frame is not None  # a state exists, so the frame does
-        down = s.position_down_m - frame.origin_in_fleet_ned_m.down
+        down = frame.to_local(Ned(0.0, 0.0, s.position_down_m)).down
         return self.link.setpoint(
             self.autopilot.boot.last_boot_ms,
             down,

@@ -130,8 +130,6 @@ class AutopilotClient:
                     self.battery_percent = event.battery_percent
                 case wire.CommandAnswer():
                     self._answer(event, now)
-                case wire.Parameter():
-                    pass
         return fresh
 
     def _heartbeat(self, event: wire.Heartbeat, now: Instant) -> None:

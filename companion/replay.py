@@ -1,5 +1,6 @@
 """Replay: the agent on recorded inputs, its outputs compared with the recorded ones."""
 
+import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,8 +36,6 @@ class ReplayResult:
 
 def replay_file(path: Path) -> ReplayResult:
     """Replay one recording; CompanionError if the file is none."""
-    import tomllib
-
     try:
         recording = read_recording(path)
     except OSError as error:

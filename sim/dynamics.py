@@ -165,12 +165,11 @@ class LoopGains:
 class OrnsteinUhlenbeck:
     """Three independent Ornstein-Uhlenbeck processes, started from their stationary distribution."""
 
-    __slots__ = ("_bound", "_decay", "_kick", "_random", "_sigma", "down", "east", "north")
+    __slots__ = ("_bound", "_decay", "_kick", "_random", "down", "east", "north")
 
     def __init__(
         self, sigma: float, time_constant_s: float, dt_s: float, rng: random.Random, bound: float = math.inf
     ) -> None:
-        self._sigma = sigma
         self._bound = bound
         self._decay = math.exp(-dt_s / time_constant_s)
         self._kick = sigma * math.sqrt(1.0 - self._decay * self._decay)

@@ -2,11 +2,10 @@
 
 import json
 import socket
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
-from companion.config import FleetConfig
+from companion.config import FleetConfig, read_tables
 from companion.errors import CompanionError, ConfigError
 from sim.px4.faults import Fault, decode_order, encode_order
 from sim.stub_fleet import stub_port
@@ -48,12 +47,7 @@ def load_scenario(path: Path, config: FleetConfig) -> tuple[ScheduledFault, ...]
     The file has tables `[[fault]]` with at_s (s after take-off), vehicle, kind, and optionally magnitude, duration_s,
     offset_ned_m. ConfigError names file, table and what is wrong.
     """
-    try:
-        tables = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: is not valid TOML: {error}") from error
+    tables = read_tables(path)
     rows = tables.get("fault")
     if set(tables) != {"fault"} or not isinstance(rows, list):
         raise ConfigError(f"{path.name}: must hold tables [[fault]] alone, got {', '.join(tables) or 'none'}")

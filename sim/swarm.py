@@ -8,7 +8,7 @@ and no array has N x N entries.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
 from types import ModuleType
@@ -662,9 +662,3 @@ def _start_estimates(s: Any, setup: Setup, table: Floats, o: Any) -> None:
 def setup_salt(agent: int) -> int:
     """Keeps an agent's first draws apart from its later streams."""
     return 7_000_003 + agent
-
-
-def mean_and_spread(values: Sequence[float]) -> tuple[float, float]:
-    """Mean and sample standard deviation (0 for one value)."""
-    a = np.asarray(values, dtype=float)
-    return float(a.mean()), float(a.std(ddof=1)) if a.size > 1 else 0.0

@@ -5,7 +5,6 @@ its slots; a heading turns them into the fleet frame. Shapes exist for every N >
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from hashlib import blake2s
 from math import ceil, cos, pi, sin, sqrt
 
 import numpy as np
@@ -134,9 +133,3 @@ def assign(origins: Sequence[Ned], slots: Sequence[Ned], pinned: Mapping[int, in
         cost[row, slot] = 0.0
     _, columns = linear_sum_assignment(cost)
     return tuple(int(c) for c in columns)
-
-
-def assignment_hash(assignment: Mapping[int, int]) -> str:
-    """A short digest of vehicle id -> slot, for comparison between vehicles."""
-    text = ",".join(f"{vehicle}:{slot}" for vehicle, slot in sorted(assignment.items()))
-    return blake2s(text.encode(), digest_size=6).hexdigest()

@@ -9,7 +9,7 @@ the largest wins, which is how vehicles without a leader agree on one of several
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from math import atan2, copysign, cos, dist, hypot, inf, pi, sin, sqrt
+from math import atan2, copysign, cos, dist, hypot, inf, sin, sqrt
 from typing import Literal, NamedTuple
 
 from companion.core.formation import Slots, assign
@@ -472,12 +472,6 @@ def top_speed_m_s(motion: Motion) -> float:
             fastest = max(fastest, hypot(v.north, v.east))
         since += duration
     return fastest
-
-
-def course_rad(velocity_ned_m_s: Ned) -> float | None:
-    """Course over ground (rad, clockwise from north); None below 5 cm/s."""
-    north, east, _ = velocity_ned_m_s
-    return atan2(east, north) % (2 * pi) if hypot(north, east) > 0.05 else None
 
 
 @dataclass(slots=True)

@@ -124,20 +124,12 @@ class CommandAnswer:
     result: int
 
 
-@dataclass(frozen=True, slots=True)
-class Parameter:
-    """PARAM_VALUE (22), decoded by PX4's convention (INT32 bytewise in the float)."""
-
-    name: str
-    value: float | int
-
-
 Event = (
     Heartbeat | LocalPosition | GlobalOrigin | CurrentMode | LandedState | EstimatorHealth | SystemHealth
-    | CommandAnswer | Parameter
+    | CommandAnswer
 )  # fmt: skip
 
-_READ = frozenset({0, 1, 22, 32, 49, 77, 230, 245, 436})
+_READ = frozenset({0, 1, 32, 49, 77, 230, 245, 436})
 ORIGIN_MESSAGE_ID = 49
 REQUEST_MESSAGE = mavlink.MAV_CMD_REQUEST_MESSAGE
 STREAMS_HZ = {32: 50.0, 436: 20.0, 245: 5.0, 230: 1.0, 1: 1.0}
@@ -271,8 +263,6 @@ class MavlinkLink:
                 if message.target_component not in (0, COMPANION_COMPONENT_ID):
                     return None
                 return CommandAnswer(message.command, message.result)
-            case mavlink.MAVLink_param_value_message():
-                return Parameter(message.param_id.rstrip("\x00"), parameter_value(message))
         self.not_read += 1
         return None
 
@@ -303,12 +293,6 @@ class MavlinkLink:
         values = [*parameters, *([0.0] * (7 - len(parameters)))]
         return self._pack(
             mavlink.MAVLink_command_long_message(self.system_id, AUTOPILOT_COMPONENT_ID, command, 0, *values)
-        )
-
-    def request_parameter(self, name: str) -> bytes:
-        """PARAM_REQUEST_READ (20) by name."""
-        return self._pack(
-            mavlink.MAVLink_param_request_read_message(self.system_id, AUTOPILOT_COMPONENT_ID, name.encode(), -1)
         )
 
     def _pack(self, message: Any) -> bytes:

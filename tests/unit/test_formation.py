@@ -13,7 +13,6 @@ from companion.core.formation import (
     SHAPES,
     Slots,
     assign,
-    assignment_hash,
     centred,
     minimum_distance,
     pairwise_distances_m,
@@ -186,10 +185,3 @@ def test_paths_flown_together_keep_apart(before: str, after: str) -> None:
     start, end = np.array(a), np.array([b[k] for k in order])
     nearest = min(minimum_distance((1 - m) * start + m * end) for m in np.linspace(0.0, 1.0, 101))
     assert nearest >= 4.0 / sqrt(2.0) - 1e-6
-
-
-def test_hash_tells_assignments_apart_and_not_the_order_of_a_table() -> None:
-    a = {1: 0, 2: 1, 3: 2}
-    assert assignment_hash(a) == assignment_hash({3: 2, 1: 0, 2: 1})
-    assert len({assignment_hash(dict(zip((1, 2, 3), p, strict=True))) for p in permutations(range(3))}) == 6
-    assert assignment_hash({1: 11}) != assignment_hash({11: 1})

@@ -24,7 +24,6 @@ from companion.core.plan import (
     VelocityLeg,
     assignment_matches,
     blend_duration_s,
-    course_rad,
     goto_duration_s,
     leg_duration_s,
     minimum_jerk,
@@ -326,21 +325,6 @@ def test_an_assignment_that_is_not_ours_is_told_apart() -> None:
     assert not assignment_matches(ours, shape_slots("line", 5, 4.1), {})
     assert not assignment_matches(ours, shape_slots("line", 6, 4.0), {})
     assert not assignment_matches(ours, shape_slots("line", 4, 4.0), {})
-
-
-@pytest.mark.parametrize(
-    ("velocity", "expected"),
-    [
-        (Ned(1.0, 0.0, 0.0), 0.0),
-        (Ned(0.0, 1.0, 5.0), pi / 2),
-        (Ned(-1.0, 0.0, 0.0), pi),
-        (Ned(0.0, -1.0, 0.0), 1.5 * pi),
-        (Ned(0.05, 0.0, 3.0), None),
-        (Ned(0.0501, 0.0, 0.0), 0.0),
-    ],
-)
-def test_course_is_clockwise_from_north_and_none_at_rest(velocity: Ned, expected: float | None) -> None:
-    assert course_rad(velocity) == (None if expected is None else pytest.approx(expected))
 
 
 # -- programmes: what is known of the motions ------------------------------------------------------------------------

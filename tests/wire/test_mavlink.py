@@ -66,13 +66,6 @@ HEARD: list[tuple[Any, wire.Event]] = [
     ),
     (dialect.MAVLink_sys_status_message(0, 0, 5, 0, 0, 0, 80, 0, 0, 0, 0, 0, 0), wire.SystemHealth(5, 80)),
     (dialect.MAVLink_command_ack_message(176, 0, 0, 0, SYSTEM_ID, 191), wire.CommandAnswer(176, 0)),
-    (dialect.MAVLink_param_value_message(b"MPC_XY_P", 0.75, 9, 1, 0), wire.Parameter("MPC_XY_P", 0.75)),
-    (
-        dialect.MAVLink_param_value_message(
-            b"COM_RC_OVERRIDE", struct.unpack("<f", struct.pack("<i", 3))[0], dialect.MAV_PARAM_TYPE_INT32, 1, 0
-        ),
-        wire.Parameter("COM_RC_OVERRIDE", 3),
-    ),
 ]
 
 
@@ -143,13 +136,14 @@ def test_a_command_reaches_the_own_autopilot_with_its_parameters(
     assert came == pytest.approx(list(values), nan_ok=True)
 
 
-def test_a_parameter_is_asked_for_by_name() -> None:
-    message = read(MavlinkLink(SYSTEM_ID).request_parameter("COM_OF_LOSS_T"))
-    assert (message.param_id, message.param_index) == ("COM_OF_LOSS_T", -1)
-    assert (message.target_system, message.target_component) == (SYSTEM_ID, 1)
-
-
 # -- what it hears -----------------------------------------------------------------------------------------------------
+
+
+def test_a_parameter_is_a_float_or_an_integer_bytewise_in_one() -> None:
+    number = struct.unpack("<f", struct.pack("<i", 3))[0]
+    assert wire.parameter_value(dialect.MAVLink_param_value_message(b"MPC_XY_P", 0.75, 9, 1, 0)) == 0.75
+    integer = dialect.MAVLink_param_value_message(b"COM_RC_OVERRIDE", number, dialect.MAV_PARAM_TYPE_INT32, 1, 0)
+    assert wire.parameter_value(integer) == 3
 
 
 @pytest.mark.parametrize(("message", "event"), HEARD, ids=[type(e).__name__ for _, e in HEARD])
