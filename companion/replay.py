@@ -1,7 +1,7 @@
 """Replay: the agent on recorded inputs, its outputs compared with the recorded ones."""
 
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +22,8 @@ class ReplayResult:
     outputs: int
     difference: str | None
     """the first one, or None"""
+    ticks: int = 0
+    """control ticks among the inputs, as the recording counts them"""
 
     @property
     def same(self) -> bool:
@@ -46,13 +48,18 @@ def replay_file(path: Path) -> ReplayResult:
         agent = Agent(config, int(facts["vehicle_id"]), int(facts["boot_id"]))
     except KeyError as missing:
         raise CompanionError(f"{path}: is no companion's recording: {missing} is missing") from None
-    return replay(agent, recording.entries)
+    except ValueError as error:
+        raise CompanionError(f"{path}: is no companion's recording: {error}") from None
+    return replay(agent, recording.entries, recording.complete)
 
 
-def replay(agent: Agent, entries: Iterator[Entry]) -> ReplayResult:
-    """Feed an agent recorded inputs; stops at the first output that differs."""
+def replay(agent: Agent, entries: Iterable[Entry], complete: bool = True) -> ReplayResult:
+    """Feed an agent recorded inputs; stops at the first output that differs.
+
+    Of a recording that is not complete (its process was killed) the last outputs may be missing.
+    """
     expected: list[tuple[str, bytes]] = []
-    inputs = outputs = 0
+    inputs = outputs = ticks = 0
     for entry in entries:
         if entry.channel in OUTPUTS:
             outputs += 1
@@ -65,6 +72,7 @@ def replay(agent: Agent, entries: Iterator[Entry]) -> ReplayResult:
                     f"replayed {channel} {body.hex()}"
                 )  # fmt: skip
             continue
+        ticks += entry.channel == "tick"
         if entry.channel not in INPUTS:
             continue
         if expected:
@@ -72,7 +80,10 @@ def replay(agent: Agent, entries: Iterator[Entry]) -> ReplayResult:
             return ReplayResult(inputs, outputs, f"{_at(entry)}: replayed {channel} {body.hex()}, recorded nothing")
         inputs += 1
         expected = list(INPUTS[entry.channel](agent, entry.body, entry.instant))
-    return ReplayResult(inputs, outputs, None)
+    if expected and complete:
+        channel, body = expected[0]
+        return ReplayResult(inputs, outputs, f"at the end: replayed {channel} {body.hex()}, recorded nothing", ticks)
+    return ReplayResult(inputs, outputs, None, ticks)
 
 
 def _at(entry: Entry) -> str:
