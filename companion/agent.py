@@ -51,6 +51,7 @@ TIMER_SLACK = 1.5
 """without a new position the control tick comes this many periods after the last"""
 PROPOSAL_DELAY_NS = 3_000_000_000
 """how far ahead a vehicle proposes a start that follows by itself"""
+PROPOSAL_SPREAD_NS = 1_000_000_000
 SETTLED_TOLERANCE_M = 0.6
 SETTLED_FOR_NS = 1_000_000_000
 ALTITUDE_TOLERANCE_M = 0.4
@@ -152,6 +153,8 @@ class Agent:
         self._silence_limit_s = 0.0
         self._resend_ns: list[int] = []
         self._plan_due_ns: int | None = None
+        self._propose_ns: int | None = None
+        """when to propose what follows, if nobody has by then (monotonic)"""
         self._behind = False
         self._phase_since_ns = 0
         self._settled_since_ns: int | None = None
@@ -192,9 +195,9 @@ class Agent:
     def receive_presence(self, vehicle_id: int, alive: bool, now: Instant) -> None:
         """A peer's process appeared or ended."""
         self.peers.presence(vehicle_id, alive, now)
-        if alive and vehicle_id in self.peers.ids:
+        if alive and vehicle_id in self.peers.ids and self.programme.newest.revision > 0 and self._plan_due_ns is None:
             # Whoever comes late has our last state from the cache; the plan it may lack is told again.
-            self._plan_due_ns = now.monotonic_ns if self.programme.newest.revision > 0 else None
+            self._plan_due_ns = now.monotonic_ns + self._random.randrange(CATCH_UP_NS)
 
     def receive_command(self, payload: bytes, now: Instant) -> bytes:
         """An operator's command as JSON; returns the answer as JSON."""
@@ -327,20 +330,31 @@ class Agent:
         self._behind = theirs > ours
 
     def _propose(self, now: Instant) -> None:
-        """Go on by itself: form once all are in the air, fly the plan once all have formed."""
-        if not self.config.plan.automatic:
-            return
+        """Go on by itself: form once all are in the air, fly the plan once all have formed.
+
+        Each waits a time of its own first, so that mostly one proposes and the others follow: proposals of all at
+        once, each checked by all, stop a crowd on one machine for a second.
+        """
         newest = self.programme.newest
-        phases = list(self.peers.phases().values())
+        forms = newest.revision == 0 and self.phase is Phase.FORMING and self._all_up()
+        flies = newest.revision == 1 and self.phase is Phase.FORMED and not newest.legs and self._all_formed()
+        if not self.config.plan.automatic or not (forms or flies):
+            self._propose_ns = None
+            return
+        if self._propose_ns is None:
+            self._propose_ns = now.monotonic_ns + self._random.randrange(PROPOSAL_SPREAD_NS)
+        if now.monotonic_ns < self._propose_ns:
+            return
         start_ns = now.fleet_ns + PROPOSAL_DELAY_NS
-        if newest.revision == 0 and self.phase is Phase.FORMING and all(p in FILTERED_PHASES for p in phases):
+        if forms:
             self._adopt(self._formation_motion(self.config.formation.shape, start_ns), now)
-        elif newest.revision == 1 and self.phase is Phase.FORMED and not newest.legs and self._all_formed():
-            legs = self.config.plan_legs(newest.moment(start_ns).centre.position)
-            if legs:
-                self._adopt(
-                    with_legs(newest, at_ns=start_ns, issuer=self.id, legs=legs, then=self.config.plan.then), now
-                )
+        elif legs := self.config.plan_legs(newest.moment(start_ns).centre.position):
+            then = self.config.plan.then
+            self._adopt(with_legs(newest, at_ns=start_ns, issuer=self.id, legs=legs, then=then), now)
+
+    def _all_up(self) -> bool:
+        """Every peer is in the air and steered."""
+        return all(phase in FILTERED_PHASES for phase in self.peers.phases().values())
 
     def _all_formed(self) -> bool:
         """Every peer that is there has formed under the newest motion."""
