@@ -341,13 +341,16 @@ def _minimum_distance(
 
 
 def _wire_bytes(flight: Flight, ids: Sequence[int], window: tuple[int, int]) -> float | None:
+    """Bytes a vehicle a second, from the counters told each second: between two of them they are taken to rise evenly,
+    so that a window shorter than their distance has a figure too."""
     rates = []
     for i in ids:
         rows = flight.traffic.get(i)
-        if rows is not None and len(rows):
-            inside = rows[(rows[:, 0] >= window[0]) & (rows[:, 0] <= window[1])]
-            if len(inside) > 1:
-                rates.append((inside[-1, 1] - inside[0, 1]) / ((inside[-1, 0] - inside[0, 0]) * 1e-9))
+        if rows is not None and len(rows) > 1:
+            begin, end = max(window[0], rows[0, 0]), min(window[1], rows[-1, 0])
+            if end > begin:
+                sent = np.interp([begin, end], rows[:, 0], rows[:, 1])
+                rates.append((sent[1] - sent[0]) / ((end - begin) * 1e-9))
     return _round(float(np.mean(rates))) if rates else None
 
 
