@@ -15,7 +15,7 @@ from companion.autopilot import POSITION_LIMIT_S, AutopilotClient
 from companion.config import FleetConfig
 from companion.core.estimate import BiasObserver, SendFilter
 from companion.core.frames import Ned
-from companion.core.law import NO_SUMS, add, finish, pair, separation
+from companion.core.law import finish, pair, separation, total
 from companion.core.neighbours import PeerTable, held
 from companion.core.phase import PhaseEvent, next_phase
 from companion.core.plan import (
@@ -23,6 +23,7 @@ from companion.core.plan import (
     Programme,
     Reference,
     assignment_matches,
+    motion_order,
     top_speed_m_s,
     with_formation,
     with_legs,
@@ -46,12 +47,12 @@ from companion.wire import mavlink as wire
 from companion.wire.mavlink import MavlinkLink, Px4Mode, mode_name
 from companion.wire.peer import decode_motion, decode_state, encode_motion, encode_state
 
-CONTROL_PERIOD_NS = 20_000_000
 TIMER_SLACK = 1.5
 """without a new position the control tick comes this many periods after the last"""
 PROPOSAL_DELAY_NS = 3_000_000_000
 """how far ahead a vehicle proposes a start that follows by itself"""
-PROPOSAL_SPREAD_NS = 1_000_000_000
+PROPOSAL_SPREAD_NS = 100_000_000
+"""times the vehicles: what each waits at most before it proposes; the first of all comes after about this"""
 SETTLED_TOLERANCE_M = 0.6
 SETTLED_FOR_NS = 1_000_000_000
 ALTITUDE_TOLERANCE_M = 0.4
@@ -65,6 +66,10 @@ OUR_MODES = frozenset({Px4Mode.AUTO_TAKEOFF, Px4Mode.AUTO_LOITER, Px4Mode.OFFBOA
 RESEND_NS = (250_000_000, 1_000_000_000)
 """a change of phase or motion is repeated after these delays, since one message may be lost"""
 CATCH_UP_NS = 1_000_000_000
+SPREAD_NS = 50_000_000
+"""times the vehicles, up to CATCH_UP_NS: over this time they spread what all have reason to say at once"""
+PLAN_COPIES = 2
+"""a plan that this many others have just told need not be told again"""
 POSITION_LOST_S = POSITION_LIMIT_S + 1.0
 """setpoints end POSITION_LIMIT_S after the last position, and COM_OF_LOSS_T (1 s) later the autopilot acts"""
 LOOK_PERIOD_NS = 200_000_000
@@ -120,7 +125,7 @@ class Agent:
         self.rejected: Counter[str] = Counter()
         self.link = MavlinkLink(self.vehicle.system_id)
         origin = config.origin if config.fleet.frame == "global" else None
-        self.autopilot = AutopilotClient(self.link, origin)
+        self.autopilot = AutopilotClient(self.link, origin, config.limits.control_rate_hz)
         self.programme = Programme([config.first_motion])
         others = frozenset(v.id for v in config.vehicles) - {vehicle_id}
         self.peers = PeerTable(vehicle_id, others, config.peer_limits, self.programme)
@@ -131,6 +136,7 @@ class Agent:
         self._error_trigger = config.error_trigger
         self._switching_trigger = config.switching_trigger
         self._spacing = config.message_spacing
+        self._timer_ns = round(TIMER_SLACK * 1e9 / config.limits.control_rate_hz)
         self._random = Random(vehicle_id << 32 | boot_id)
         self._bias = (BiasObserver(), BiasObserver(), BiasObserver())
         self._filter = (SendFilter(), SendFilter(), SendFilter())
@@ -153,6 +159,10 @@ class Agent:
         self._silence_limit_s = 0.0
         self._resend_ns: list[int] = []
         self._plan_due_ns: int | None = None
+        self._plan_payload = encode_motion(self.programme.newest)
+        self._plan_told = 0
+        """how often others told it since our telling became due"""
+        self._spread_ns = min(SPREAD_NS * len(config.vehicles), CATCH_UP_NS)
         self._propose_ns: int | None = None
         """when to propose what follows, if nobody has by then (monotonic)"""
         self._behind = False
@@ -180,7 +190,12 @@ class Agent:
             return
         try:
             if topic == "plan":
-                self._consider(decode_motion(payload), now)
+                if payload == self._plan_payload:
+                    self._plan_told += 1
+                    if self._plan_told >= PLAN_COPIES:
+                        self._plan_due_ns = None
+                else:
+                    self._consider(decode_motion(payload), now)
                 return
             message = decode_state(payload)
         except WireError as error:
@@ -197,7 +212,7 @@ class Agent:
         self.peers.presence(vehicle_id, alive, now)
         if alive and vehicle_id in self.peers.ids and self.programme.newest.revision > 0 and self._plan_due_ns is None:
             # Whoever comes late has our last state from the cache; the plan it may lack is told again.
-            self._plan_due_ns = now.monotonic_ns + self._random.randrange(CATCH_UP_NS)
+            self._tell_plan_soon(now)
 
     def receive_command(self, payload: bytes, now: Instant) -> bytes:
         """An operator's command as JSON; returns the answer as JSON."""
@@ -312,6 +327,7 @@ class Agent:
         changed = blend != self.programme.newest.blend_start_ns
         if not self.programme.adopt(motion):
             return
+        self._plan_payload = encode_motion(motion)
         self.peers.plan_changed()
         if self._sent is not None:
             self._sent = (self._sent[0], self._reference_of(self._sent[0]))
@@ -319,15 +335,19 @@ class Agent:
             self._settled_since_ns = None
             self._happened(PhaseEvent.UNSETTLED, now)
         self._plan_due_ns = now.monotonic_ns if motion.issuer == self.id else None
-        self._announce(now)
+        self._mention(now)
         self._outputs.notes.append(adoption_note(motion))
 
     def _compare_motions(self, message: PeerMessage, now: Instant) -> None:
-        theirs = (message.sample.revision, message.motion_start_ns, message.motion_issuer)
+        theirs = motion_order(message.sample.revision, message.motion_start_ns, message.motion_issuer)
         ours = self.programme.newest.order
         if theirs < ours and self._plan_due_ns is None:
-            self._plan_due_ns = now.monotonic_ns + self._random.randrange(CATCH_UP_NS)
+            self._tell_plan_soon(now)
         self._behind = theirs > ours
+
+    def _tell_plan_soon(self, now: Instant) -> None:
+        self._plan_due_ns = now.monotonic_ns + self._random.randrange(self._spread_ns)
+        self._plan_told = 0
 
     def _propose(self, now: Instant) -> None:
         """Go on by itself: form once all are in the air, fly the plan once all have formed.
@@ -342,7 +362,7 @@ class Agent:
             self._propose_ns = None
             return
         if self._propose_ns is None:
-            self._propose_ns = now.monotonic_ns + self._random.randrange(PROPOSAL_SPREAD_NS)
+            self._propose_ns = now.monotonic_ns + self._random.randrange(PROPOSAL_SPREAD_NS * len(self.config.vehicles))
         if now.monotonic_ns < self._propose_ns:
             return
         start_ns = now.fleet_ns + PROPOSAL_DELAY_NS
@@ -380,7 +400,7 @@ class Agent:
             return 0
         deadline = self.autopilot.next_deadline_ns()
         if self._last_tick is not None:
-            deadline = min(deadline, self._last_tick.monotonic_ns + round(TIMER_SLACK * CONTROL_PERIOD_NS))
+            deadline = min(deadline, self._last_tick.monotonic_ns + self._timer_ns)
         if self._plan_due_ns is not None:
             deadline = min(deadline, self._plan_due_ns)
         return deadline
@@ -388,13 +408,13 @@ class Agent:
     def advance(self, now: Instant) -> Outputs:
         """Do what is due; the returned outputs are to be sent in their order."""
         since = None if self._last_tick is None else now.monotonic_ns - self._last_tick.monotonic_ns
-        if self._position_came or since is None or since >= TIMER_SLACK * CONTROL_PERIOD_NS:
+        if self._position_came or since is None or since >= self._timer_ns:
             self._control(now, since)
         out = self._outputs
         out.mavlink += self.autopilot.due(now)
         if self._plan_due_ns is not None and now.monotonic_ns >= self._plan_due_ns:
             self._plan_due_ns = None
-            out.peers.append(("plan", encode_motion(self.programme.newest)))
+            out.peers.append(("plan", self._plan_payload))
         out.notes += self.autopilot.notes
         self.autopilot.notes.clear()
         self._outputs = Outputs()
@@ -471,19 +491,19 @@ class Agent:
         """
         p, v, g = ego.position_ned_m, ego.velocity_ned_m_s, self._gains
         r, rv, ra, yaw = reference
-        sums, count = NO_SUMS, 0
+        shares = []
         apart = (0.0, 0.0)
         for n in neighbours:
             q, w, d = n.position_ned_m, n.velocity_ned_m_s, n.offset_ned_m
             dx, dy, dz = p.north - q.north, p.east - q.east, p.down - q.down
             if n.in_formation:
-                count += 1
                 s = n.reference_velocity_ned_m_s
                 dvx, dvy = v.north - w.north - (rv.north - s.north), v.east - w.east - (rv.east - s.east)
-                sums = add(sums, pair(dx, dy, dz, dvx, dvy, 0.0, d.north, d.east, dz, g))
+                shares.append(pair(dx, dy, dz, dvx, dvy, 0.0, d.north, d.east, dz, g))
             elif n.other_end_ned_m is None:
                 away = separation(dx, dy, dz, g)
                 apart = (apart[0] + away[0], apart[1] + away[1])
+        sums, count = total(shares), len(shares)
         sums = sums._replace(sep_x=sums.sep_x + apart[0], sep_y=sums.sep_y + apart[1], sep_z=0.0)
         u = finish(
             count, sums,
@@ -533,7 +553,10 @@ class Agent:
             self.autopilot.cancel()
             if self.autopilot.custom_mode != Px4Mode.OFFBOARD:
                 self._failsafe(f"autopilot left our control: {mode_name(self.autopilot.custom_mode)}")
-        self._announce(now)
+        if event in (PhaseEvent.SETTLED, PhaseEvent.UNSETTLED):
+            self._mention(now)
+        else:
+            self._announce(now)
 
     def _failsafe(self, reason: str) -> None:
         self.failsafes.append(reason)
@@ -678,6 +701,11 @@ class Agent:
     def _announce(self, now: Instant) -> None:
         """Say something at once and again, whatever the trigger says."""
         self._resend_ns = [now.monotonic_ns, *(now.monotonic_ns + d for d in RESEND_NS)]
+
+    def _mention(self, now: Instant) -> None:
+        """Say it soon: of what all do at one time, a burst of messages would stop a crowd on one machine."""
+        first_ns = now.monotonic_ns + self._random.randrange(self._spread_ns)
+        self._resend_ns = [first_ns, first_ns + CATCH_UP_NS]
 
     def _reference_of(self, sample: PeerSample) -> tuple[Ned, Ned]:
         reference = self.programme.reference(self.id, sample.time_ns)

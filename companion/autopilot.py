@@ -73,8 +73,11 @@ class BootClock:
 class AutopilotClient:
     """One autopilot as seen over its link."""
 
-    def __init__(self, link: MavlinkLink, fleet_origin: Geodetic | None) -> None:
+    def __init__(
+        self, link: MavlinkLink, fleet_origin: Geodetic | None, position_rate_hz: float = wire.POSITION_RATE_HZ
+    ) -> None:
         self.link = link
+        self.position_rate_hz = position_rate_hz
         self.counts: Counter[str] = Counter()
         self.heard = 0
         """heartbeats and positions so far: what proves that it is our autopilot that speaks"""
@@ -144,7 +147,8 @@ class AutopilotClient:
 
     def _set_up(self) -> None:
         """Ask for what we read, and for no more: a companion's link may be a serial line."""
-        for message_id, rate_hz in wire.STREAMS_HZ.items():
+        streams = {**wire.STREAMS_HZ, wire.POSITION_MESSAGE_ID: self.position_rate_hz}
+        for message_id, rate_hz in streams.items():
             self.ask(f"stream {message_id}", *wire.interval_parameters(message_id, rate_hz))
         for message_id in wire.STREAMS_OFF:
             self.ask(f"stream {message_id}", *wire.interval_parameters(message_id, 0.0))

@@ -49,8 +49,8 @@ SPACING_MARGIN_M = 0.2
 """slots stay this much farther apart than separation and barrier begin to act"""
 STALE_AFTER = 2.1
 """a peer is stale after this many T_max without a word: one message may be lost"""
-LOOP_LATENCY_S = 0.12
-"""control period, delay to a peer and t_min together, as the error bound takes them"""
+EXCHANGE_LATENCY_S = 0.1
+"""delay to a peer and t_min together, as the error bound takes them beside the control period"""
 
 
 class _Table(BaseModel):
@@ -172,6 +172,7 @@ class LimitsTable(_Table):
     jerk_max_m_s3: Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)] = 100.0
     avoidance_acceleration_m_s2: Annotated[float, Field(gt=0, le=8, allow_inf_nan=False)] = 8.0
     barrier: bool = True
+    control_rate_hz: Annotated[float, Field(ge=20, le=50, allow_inf_nan=False)] = 50.0
     position_noise_m: NotNegative = 0.05
     velocity_noise_m_s: NotNegative = 0.05
     gust_m_s2: NotNegative = 0.3
@@ -335,7 +336,7 @@ class FleetConfig(_Table):
         return prediction_error_bound_m(
             epsilon_m=epsilon, gamma_s2=t.gamma_s2, sigma_p_m=limits.position_noise_m,
             sigma_v_m_s=limits.velocity_noise_m_s, sigma_gust_m_s2=limits.gust_m_s2,
-            a_max_m_s2=self.law.a_max_m_s2, latency_s=LOOP_LATENCY_S,
+            a_max_m_s2=self.law.a_max_m_s2, latency_s=EXCHANGE_LATENCY_S + 1.0 / limits.control_rate_hz,
         )  # fmt: skip
 
     @property
@@ -621,7 +622,7 @@ def _plan_faults(config: FleetConfig) -> Iterator[str]:
 
 _UNITS = {
     "_m_s3": "m/s^3", "_m_s2": "m/s^2", "_m_s": "m/s", "_deg_s": "deg/s", "_per_s": "1/s", "_s2": "s^2", "_deg": "deg",
-    "_m": "m", "_s": "s",
+    "_m": "m", "_s": "s", "_hz": "Hz",
 }  # fmt: skip
 
 

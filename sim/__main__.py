@@ -1,6 +1,7 @@
 """Command `fleet`: a whole fleet on one machine, and the operator's verbs."""
 
 import json
+import os
 import signal
 import sys
 import time
@@ -26,6 +27,9 @@ Parameters = Annotated[
     list[str] | None, typer.Option(metavar="NAME=VALUE", help="With --autopilot px4: a PX4 parameter, repeatable.")
 ]
 DEFAULT_FILE = Path("fleet.toml")
+CROWD_PER_CORE = 8
+CROWD_RATE_HZ = 25.0
+"""the control rate of a fleet whose companions share one machine, more than CROWD_PER_CORE to each of its cores"""
 FAULTS = (
     "gps_lost", "position_frozen", "estimator_reset", "noise", "low_battery", "reboot", "mute", "pilot_takeover",
     "pilot_sticks", "rc_kill", "slow_link",
@@ -148,6 +152,9 @@ def up(
     from companion.config import parse
 
     config = parse(tables, fleet.name)
+    if len(config.vehicles) > CROWD_PER_CORE * len(os.sched_getaffinity(0)):
+        tables.setdefault("limits", {}).setdefault("control_rate_hz", CROWD_RATE_HZ)
+        config = parse(tables, fleet.name)
     if autopilot == "stub":
         check_stub_links(config)
     elif gcs or scenario is not None:

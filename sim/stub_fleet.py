@@ -11,7 +11,6 @@ from sim.dynamics import DynamicsParameters, GustParameters, NoiseParameters
 from sim.stubs import StubFleetSettings, StubVehicleSettings
 
 LAND_ON_LOSS = 4
-POSITION_PERIOD_NS = 20_000_000
 FLEET_PARAMETERS: tuple[tuple[str, float | int], ...] = (
     ("COM_OBL_RC_ACT", LAND_ON_LOSS),
     ("COM_RC_OVERRIDE", 3),
@@ -74,7 +73,7 @@ def stub_settings(
                     -v.pad_north_m, -v.pad_east_m, 0.0
                 ),
                 yaw_rad=radians(config.formation.heading_deg),
-                booted_before_ns=round(k / len(config.vehicles) * POSITION_PERIOD_NS),
+                booted_before_ns=round(k / len(config.vehicles) * 1e9 / config.limits.control_rate_hz),
                 parameters=FLEET_PARAMETERS,
             )
         )  # fmt: skip

@@ -184,6 +184,7 @@ def summarise(flight: Flight) -> dict[str, Any]:
         "lost": sorted(flight.lost),
         "failsafes": flight.failsafes,
         "rejected": dict(flight.rejected),
+        "control_rate_hz": config.limits.control_rate_hz,
         "seed": flight.seed,
         "versions": dict(flight.versions),
     }

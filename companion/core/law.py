@@ -20,7 +20,8 @@ outweigh separation; k_v, a_d and k_p keep the formation moving and in place, wh
 brakes it to a standstill. `Gains` with `normalise = 0`, infinite saturations, `k_v = k_p = 0` is Eq. (2) itself.
 """
 
-from math import inf, sqrt
+from collections.abc import Sequence
+from math import fsum, inf, sqrt
 from typing import NamedTuple
 
 DISTANCE_FLOOR_M = 0.2
@@ -141,14 +142,9 @@ def _share(ab: float, bb: float, aa: float, a_max: float) -> float:
 NO_SUMS = Sums(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-def add(a: Sums, b: Sums) -> Sums:
-    """The sums of two neighbours together."""
-    a0, a1, a2, a3, a4, a5, a6, a7, a8, a9, a10, a11 = a
-    b0, b1, b2, b3, b4, b5, b6, b7, b8, b9, b10, b11 = b
-    return Sums(
-        a0 + b0, a1 + b1, a2 + b2, a3 + b3, a4 + b4, a5 + b5,
-        a6 + b6, a7 + b7, a8 + b8, a9 + b9, a10 + b10, a11 + b11,
-    )  # fmt: skip
+def total(shares: Sequence[Sums]) -> Sums:
+    """The sums over the neighbours, rounded once: the neighbours' order is of no matter."""
+    return Sums(*map(fsum, zip(*shares, strict=True))) if shares else NO_SUMS
 
 
 def paper_gains(k_s: float, k_a: float, k_c: float, r0: float) -> Gains:

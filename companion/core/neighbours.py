@@ -1,6 +1,7 @@
 """The peer table: what this vehicle knows of the others, and what that says about now."""
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import dist, isfinite
 from statistics import median
@@ -17,6 +18,7 @@ PRESENCE_DELAY_S = 1.5
 VERTICAL_DAMPING_S = 2.0
 GATE_VELOCITY_M_S = 0.7
 GATE_RESIDUAL_M = 2.0
+GATE_PERIOD_NS = 100_000_000
 UNCERTAINTY_GROWTH_M_S = 0.3
 UNCERTAINTY_GROWTH_MAX_M = 1.0
 
@@ -86,6 +88,9 @@ class PeerTable:
     programme: Programme
     rejected: Counter[str] = field(default_factory=Counter)
     _peers: dict[int, _Peer] = field(default_factory=dict)
+    _gated: frozenset[int] = frozenset()
+    _gated_until_ns: int = 0
+    """when the gates are looked at anew (monotonic ns)"""
 
     def __post_init__(self) -> None:
         self._peers = {i: _Peer() for i in sorted(self.ids)}
@@ -213,7 +218,14 @@ class PeerTable:
                 n = self._predict(peer, peer.sample, now, moment.slot(slots[i]), own)
                 if self._in_range(n, ego_ned_m):
                     neighbours.append(n)
-        return _gate(neighbours, ego_ned_m) if gated else neighbours
+        if not gated:
+            return neighbours
+        if now.monotonic_ns >= self._gated_until_ns:
+            self._gated_until_ns = now.monotonic_ns + GATE_PERIOD_NS
+            self._gated = outliers(neighbours, ego_ned_m)
+        if not self._gated:
+            return neighbours
+        return [n._replace(in_formation=False) if n.vehicle_id in self._gated else n for n in neighbours]
 
     def _in_range(self, n: Neighbour, ego_ned_m: Ned) -> bool:
         limit, other = self.limits.range_m, n.other_end_ned_m
@@ -234,18 +246,20 @@ class PeerTable:
             uncertainty += min(UNCERTAINTY_GROWTH_M_S * max(since_s, 0.0), UNCERTAINTY_GROWTH_MAX_M)
             position, velocity, other_end = self._both_ends(peer, sample, peer.lost_at_ns, now)
         slot = reference.position_ned_m
+        heard = flying and not lost
+        # By place: naming the fields costs as much again, for every peer at every tick.
         return Neighbour(
-            vehicle_id=sample.vehicle_id,
-            position_ned_m=position,
-            velocity_ned_m_s=velocity,
-            offset_ned_m=Ned(own.north - slot.north, own.east - slot.east, own.down - slot.down),
-            age_s=tau_s,
-            in_formation=flying and not lost,
-            shares_avoidance=flying and not lost,
-            uncertainty_m=uncertainty,
-            other_end_ned_m=other_end,
-            reference_velocity_ned_m_s=reference.velocity_ned_m_s,
-            reference_acceleration_ned_m_s2=reference.acceleration_ned_m_s2,
+            sample.vehicle_id,
+            position,
+            velocity,
+            Ned(own.north - slot.north, own.east - slot.east, own.down - slot.down),
+            tau_s,
+            heard,
+            heard,
+            uncertainty,
+            other_end,
+            reference.velocity_ned_m_s,
+            reference.acceleration_ned_m_s2,
         )
 
     def _both_ends(self, peer: _Peer, sample: PeerSample, lost_at_ns: int, now: Instant) -> tuple[Ned, Ned, Ned]:
@@ -275,19 +289,19 @@ def is_outlier(velocity_north: float, velocity_east: float, residual_north: floa
     )
 
 
-def _gate(neighbours: list[Neighbour], ego: Ned) -> list[Neighbour]:
-    north, east = [], []
+def outliers(neighbours: Sequence[Neighbour], ego: Ned) -> frozenset[int]:
+    """Ids of those in formation whose prediction is far from what the others' say."""
+    residuals = []
     for n in neighbours:
         if n.in_formation:
-            north.append(ego.north - n.position_ned_m.north - n.offset_ned_m.north)
-            east.append(ego.east - n.position_ned_m.east - n.offset_ned_m.east)
-    if not north:
-        return neighbours
-    middle_north, middle_east = median(north), median(east)
-    gated = list(neighbours)
-    taking_part = (k for k, n in enumerate(neighbours) if n.in_formation)
-    for k, r_north, r_east in zip(taking_part, north, east, strict=True):
-        v, slot = neighbours[k].velocity_ned_m_s, neighbours[k].reference_velocity_ned_m_s
-        if is_outlier(v.north - slot.north, v.east - slot.east, r_north - middle_north, r_east - middle_east):
-            gated[k] = neighbours[k]._replace(in_formation=False)
-    return gated
+            p, d = n.position_ned_m, n.offset_ned_m
+            residuals.append((n, ego.north - p.north - d.north, ego.east - p.east - d.east))
+    if not residuals:
+        return frozenset()
+    middle_north, middle_east = median(r[1] for r in residuals), median(r[2] for r in residuals)
+    gated = []
+    for n, north, east in residuals:
+        v, slot = n.velocity_ned_m_s, n.reference_velocity_ned_m_s
+        if is_outlier(v.north - slot.north, v.east - slot.east, north - middle_north, east - middle_east):
+            gated.append(n.vehicle_id)
+    return frozenset(gated)

@@ -274,6 +274,11 @@ class Moment(NamedTuple):
         )
 
 
+def motion_order(revision: int, start_ns: int, issuer: int) -> tuple[int, int, int]:
+    """What `Motion.order` is, of a motion that is only named."""
+    return (revision, -start_ns, issuer)
+
+
 @dataclass(frozen=True)
 class Motion:
     """The fleet's motion from `start_ns` on: immutable, the same bytes on every vehicle."""
@@ -307,8 +312,9 @@ class Motion:
 
     @property
     def order(self) -> tuple[int, int, int]:
-        """Larger wins."""
-        return (self.revision, self.start_ns, self.issuer)
+        """Larger wins: the newest revision, and of several proposals for it the one that starts first, which mostly is
+        the one that most have heard by then."""
+        return motion_order(self.revision, self.start_ns, self.issuer)
 
     @cached_property
     def _starts(self) -> tuple[tuple[float, Ned, Ned, float], ...]:

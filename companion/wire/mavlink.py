@@ -132,7 +132,9 @@ Event = (
 _READ = frozenset({0, 1, 32, 49, 77, 230, 245, 436})
 ORIGIN_MESSAGE_ID = 49
 REQUEST_MESSAGE = mavlink.MAV_CMD_REQUEST_MESSAGE
-STREAMS_HZ = {32: 50.0, 436: 20.0, 245: 5.0, 230: 1.0, 1: 1.0}
+POSITION_MESSAGE_ID = 32
+POSITION_RATE_HZ = 50.0
+STREAMS_HZ = {POSITION_MESSAGE_ID: POSITION_RATE_HZ, 436: 20.0, 245: 5.0, 230: 1.0, 1: 1.0}
 """what the companion asks for with SET_MESSAGE_INTERVAL"""
 STREAMS_OFF = (30, 31, 33, 105, 331, 111, 141, 132, 83, 85, 36, 74, 24, 87)
 """what a companion's link carries by default and nobody here reads"""

@@ -1,9 +1,9 @@
 """The law: equivariant, saturated, within its budget, and Eq. (2) of the paper with the paper's gains."""
 
 from collections.abc import Sequence
-from functools import reduce
 from itertools import pairwise
 from math import inf, pi, sqrt
+from random import Random
 
 import numpy as np
 import numpy.typing as npt
@@ -16,11 +16,11 @@ from companion.core.law import (
     NO_SUMS,
     Gains,
     Sums,
-    add,
     finish,
     pair,
     paper_gains,
     separation,
+    total,
     within_budget,
 )
 
@@ -60,9 +60,8 @@ def scenes(draw: st.DrawFn, least: int = 0, most: int = 6) -> Scene:
 
 
 def command(s: Scene, g: Gains) -> Vector:
-    sums = NO_SUMS
-    for k in range(1, len(s.p)):
-        sums = add(sums, pair(*map(float, (*(s.p[0] - s.p[k]), *(s.v[0] - s.v[k]), *(s.ref[0] - s.ref[k]))), g))
+    rows = ((*(s.p[0] - s.p[k]), *(s.v[0] - s.v[k]), *(s.ref[0] - s.ref[k])) for k in range(1, len(s.p)))
+    sums = total([pair(*map(float, row), g) for row in rows])
     own = map(float, (*(s.p[0] - s.ref[0]), *(s.v[0] - s.v_d), *s.a_d))
     return np.array(finish(float(len(s.p) - 1), sums, *own, g))
 
@@ -252,17 +251,20 @@ def test_a_formation_in_place_and_at_speed_is_left_alone() -> None:
 
 
 @PROPERTY
-@given(st.lists(st.tuples(*[st.floats(-10, 10)] * 12), min_size=1, max_size=6))
-def test_adding_sums_is_adding_their_entries(rows: list[tuple[float, ...]]) -> None:
-    total = reduce(add, (Sums(*r) for r in rows), NO_SUMS)
-    assert total == pytest.approx(tuple(np.sum(rows, axis=0)), abs=1e-9)
+@given(st.lists(st.tuples(*[st.floats(-10, 10)] * 12), max_size=6), st.randoms())
+def test_the_total_is_the_sum_of_the_entries_whatever_their_order(rows: list[tuple[float, ...]], r: Random) -> None:
+    shares = [Sums(*row) for row in rows]
+    sums = total(shares)
+    assert sums == pytest.approx(tuple(np.sum(np.array(rows).reshape(-1, 12), axis=0)), abs=1e-9)
+    r.shuffle(shares)
+    assert total(shares) == sums
 
 
 @pytest.mark.parametrize("n", [1, 4, 15])
 def test_the_crowd_does_not_make_the_law_stiffer(n: int) -> None:
     """With n equal neighbours the command is that of one."""
     one = pair(6.0, 0.0, 0.0, 0.3, 0.0, 0.0, 5.5, 0.0, 0.0, FLIGHT)
-    sums = reduce(add, [one] * n)
+    sums = total([one] * n)
     g = FLIGHT._replace(k_p=0.0)
     assert finish(float(n), sums, *[0.0] * 9, g) == pytest.approx((-3.0 * 0.3 - 4.0 * 0.5, 0.0, 0.0))
 

@@ -369,15 +369,15 @@ def test_adopting_says_whether_something_changed() -> None:
     assert programme.adopt(proposal((1, 2, 3)))
     assert not programme.adopt(proposal((1, 2, 3)))
     assert not programme.adopt(proposal((1, 2, 2)))
-    assert not programme.adopt(proposal((1, 1, 9)))
+    assert not programme.adopt(proposal((1, 3, 9)))
     assert programme.adopt(proposal((1, 2, 4)))
-    assert programme.adopt(proposal((1, 3, 0)))
-    assert programme.adopt(proposal((2, 0, 0)))
+    assert programme.adopt(proposal((1, 1, 0)))
+    assert programme.adopt(proposal((2, 9, 0)))
     assert not programme.adopt(proposal((1, 9, 9)))
 
 
 def test_two_proposals_for_one_revision_leave_one() -> None:
-    for order in permutations([(1, 1, 5), (1, 2, 1), (1, 2, 4)]):
+    for order in permutations([(1, 3, 5), (1, 2, 1), (1, 2, 4)]):
         assert [m.order for m in after_adopting(list(order)).motions[1:]] == [proposal((1, 2, 4)).order]
 
 
