@@ -685,7 +685,8 @@ class Agent:
 
     def _settle(self, ego: VehicleState, reference: Reference, now: Instant) -> None:
         motion = self.programme.at(now.fleet_ns)
-        if self.phase is not Phase.FORMING or motion.shape == "pads" or now.fleet_ns < motion.blend_end_ns:
+        on_its_way = motion is not self.programme.newest or now.fleet_ns < motion.blend_end_ns
+        if self.phase is not Phase.FORMING or motion.shape == "pads" or on_its_way:
             return
         p, r = ego.position_ned_m, reference.position_ned_m
         near = hypot(p.north - r.north, p.east - r.east) < SETTLED_TOLERANCE_M and abs(p.down - r.down) < 1.0
