@@ -11,10 +11,10 @@ from math import dist, hypot
 from random import Random
 from typing import Any
 
-from companion.autopilot import POSITION_LIMIT_S, AutopilotClient
+from companion.autopilot import AutopilotClient
 from companion.config import FleetConfig
 from companion.core.estimate import BiasObserver, SendFilter
-from companion.core.frames import Ned
+from companion.core.frames import Ned, geodetic_to_ned
 from companion.core.law import finish, pair, separation, total
 from companion.core.neighbours import PeerTable, held
 from companion.core.phase import PhaseEvent, next_phase
@@ -43,6 +43,7 @@ from companion.core.values import (
     VehicleState,
 )
 from companion.errors import ConfigError, WireError
+from companion.preflight import POSITION_LIMIT_S, Account, Check, assignment_hash, own_checks, unmet
 from companion.wire import mavlink as wire
 from companion.wire.mavlink import MavlinkLink, Px4Mode, mode_name
 from companion.wire.peer import decode_motion, decode_state, encode_motion, encode_state
@@ -171,6 +172,8 @@ class Agent:
         self._formation_since_ns: int | None = None
         self._mode_asked_ns = 0
         self._land_seen = False
+        self._assignment: str | None = None
+        """hash of the first formation's assignment, once asked for"""
         self._outputs = Outputs()
 
     # -- inputs ------------------------------------------------------------------------------------------------------
@@ -281,13 +284,51 @@ class Agent:
 
     def unready(self, now: Instant) -> list[str]:
         """Why this vehicle may not take off; empty when it may."""
-        reasons = self.autopilot.unready(now)
-        if self.autopilot.armed and self.phase in (Phase.IDLE, Phase.LANDED) and not self._take_off_wanted:
-            reasons.append("armed by somebody else")
+        return [c.says for c in unmet(self.checks(now))]
+
+    def checks(self, now: Instant) -> tuple[Check, ...]:
+        """Every row of this vehicle's own preflight."""
+        place = None
+        if self.phase not in FLYING and self.programme.newest.revision == 0:
+            place = Ned(self.vehicle.pad_north_m, self.vehicle.pad_east_m, 0.0)
+        rows = own_checks(self.autopilot.facts(now), self.config, self.vehicle, place)
+        ours = self.phase not in (Phase.IDLE, Phase.LANDED) or self._take_off_wanted
+        strange = self.autopilot.armed and not ours
         silent = [i for i, phase in self.peers.phases().items() if phase is None]
-        if silent:
-            reasons.append(f"not heard: vehicle {', '.join(str(i) for i in silent)}")
-        return reasons
+        others = len(self.peers.ids)
+        return (
+            *rows,
+            Check(
+                "armed", "by somebody else" if strange else "no" if not self.autopilot.armed else "by its companion",
+                "not by somebody else", not strange, "armed by somebody else", vehicle=self.id,
+            ),
+            Check(
+                "peers heard", others - len(silent), f"= {others}", not silent,
+                f"not heard: vehicle {', '.join(str(i) for i in silent)}", vehicle=self.id,
+            ),
+        )  # fmt: skip
+
+    def account(self, now: Instant, own_id_heard: bool = False) -> Account:
+        """The answer to a preflight question."""
+        facts = self.autopilot.facts(now)
+        if self._assignment is None:
+            self._assignment = assignment_hash(self.config)
+        origin = None if facts.origin is None else geodetic_to_ned(facts.origin, self.config.origin)
+        return Account(
+            vehicle=self.id,
+            boot_id=self.boot_id,
+            system_id=self.vehicle.system_id,
+            configuration=self.config.shared_hash,
+            assignment=self._assignment,
+            flying=self.phase in FLYING,
+            revision=self.programme.newest.revision,
+            position_ned_m=facts.position_ned_m,
+            slot_ned_m=self.programme.reference(self.id, now.fleet_ns).position_ned_m,
+            origin_ned_m=origin,
+            home_altitude_amsl_m=facts.home_altitude_amsl_m,
+            own_id_heard=own_id_heard,
+            checks=self.checks(now),
+        )
 
     # -- motions -----------------------------------------------------------------------------------------------------
 
@@ -762,12 +803,14 @@ class Agent:
         """What the operator's table shows; plain values."""
         tick = self._tick
         age = self.peers.oldest_age_s(now)
+        unready = unmet(self.checks(now))
         return {
             "vehicle": self.id,
             "phase": self.phase.name.lower(),
             "mode": mode_name(self.autopilot.custom_mode),
             "armed": self.autopilot.armed,
-            "ready": self.unready(now),
+            "ready": [c.says for c in unready],
+            "unfit": [c.says for c in unready if c.lasting],
             "revision": self.programme.newest.revision,
             "shape": self.programme.newest.shape,
             "moving": self.programme.newest.end_ns is None or bool(self.programme.newest.legs),

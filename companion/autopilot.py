@@ -11,24 +11,25 @@ from math import inf
 
 from companion.core.frames import Geodetic, LocalFrame, Ned
 from companion.core.values import ZERO, Instant
+from companion.preflight import PARAMETERS, POSITION_LIMIT_S, AutopilotFacts
 from companion.wire import mavlink as wire
 from companion.wire.mavlink import MavlinkLink, Px4Mode
 
 RETRY_S = 0.5
 TRIES = 8
-HEARTBEAT_LIMIT_S = 3.0
-POSITION_LIMIT_S = 0.5
-"""a position older than this is stale: no setpoint is made from it"""
+PARAMETER_TRIES = 6
+PARAMETERS_AT_ONCE = 3
+"""requests on the way at a time: a serial line carries the positions too"""
+PARAMETER_PERIOD_NS = 5_000_000_000
+"""how often all are read anew on the ground, since a ground station may set them"""
+ROUND_TRIP_PERIOD_NS = 1_000_000_000
+ROUND_TRIP_SAMPLES = 5
+ROUND_TRIP_SILENCE_NS = 3_500_000_000
+CLOCK_SAMPLES = 5
+RATE_WINDOW_NS = 2_000_000_000
 LATENCY_WINDOW_NS = 1_000_000_000
 """short, since a simulated autopilot's clock may run several per cent slow: what it falls behind within the window
 counts as delay"""
-ACCURACY_LIMIT_M = 3.0
-"""PX4's own limit for arming (EKF2_REQ_EPH); flags alone stay up for seconds after the position sensor's end"""
-ESTIMATOR_FLAGS_NEEDED = 1 | 2 | 4
-"""ESTIMATOR_STATUS: attitude, horizontal and vertical velocity"""
-ESTIMATOR_GLOBAL_FLAG = 16
-"""absolute horizontal position"""
-ESTIMATOR_RELATIVE_FLAG = 8
 ACCEPTED, TEMPORARILY_REJECTED, IN_PROGRESS = 0, 1, 5
 
 
@@ -70,6 +71,54 @@ class BootClock:
         return boot_ms * 1_000_000 + self._window[0][1]
 
 
+@dataclass(slots=True)
+class ParameterReader:
+    """Reads the parameters that preflight looks at, in rounds; one that never comes is missing until it does."""
+
+    values: dict[str, float | int] = field(default_factory=dict)
+    missing: set[str] = field(default_factory=set)
+    _open: dict[str, tuple[int, int]] = field(default_factory=lambda: dict.fromkeys(PARAMETERS, (0, 0)))
+    """still wanted in this round: (tries so far, when the next is due)"""
+    _round_ns: int = 0
+    """when the next round begins"""
+
+    def restart(self) -> None:
+        """Forget: the autopilot has booted anew."""
+        self.values.clear()
+        self.missing.clear()
+        self._open = dict.fromkeys(PARAMETERS, (0, 0))
+
+    def take(self, name: str, value: float | int) -> None:
+        """A value that came, asked for or not."""
+        if name in PARAMETERS:
+            self.values[name] = value
+            self.missing.discard(name)
+            self._open.pop(name, None)
+
+    def due(self, now_ns: int) -> list[str]:
+        """Names to ask for now."""
+        if not self._open and now_ns >= self._round_ns:
+            self._open = dict.fromkeys(PARAMETERS, (0, 0))
+        asked = []
+        for name, (tries, next_ns) in list(self._open.items())[:PARAMETERS_AT_ONCE]:
+            if now_ns < next_ns:
+                continue
+            if tries >= PARAMETER_TRIES:
+                del self._open[name]
+                self.values.pop(name, None)
+                self.missing.add(name)
+            else:
+                self._open[name] = (tries + 1, now_ns + round(RETRY_S * 1e9))
+                asked.append(name)
+        self._round_ns = now_ns + PARAMETER_PERIOD_NS if self._open else self._round_ns
+        return asked
+
+    def next_deadline_ns(self) -> int:
+        """When `due` next has something to say (monotonic ns)."""
+        waiting = list(self._open.values())[:PARAMETERS_AT_ONCE]
+        return min((next_ns for _, next_ns in waiting), default=self._round_ns)
+
+
 class AutopilotClient:
     """One autopilot as seen over its link."""
 
@@ -90,6 +139,9 @@ class AutopilotClient:
         self.vehicle_type = -1
         self.landed_state = 0
         self.battery_percent = -1
+        self.sensors_health = 0
+        self.home_altitude_amsl_m: float | None = None
+        self.parameters = ParameterReader()
         self.estimator_flags = 0
         self.horizontal_accuracy_m = inf
         self.origin: Geodetic | None = None
@@ -107,6 +159,14 @@ class AutopilotClient:
         self._now_ns = 0
         self._next_heartbeat_ns = 0
         self._next_origin_ns = 0
+        self._arrivals_ns: deque[int] = deque(maxlen=512)
+        """of the latest positions"""
+        self._round_trips_ns: deque[int] = deque(maxlen=ROUND_TRIP_SAMPLES)
+        self._round_trip_asked_ns = 0
+        self._round_trips_open_ns: deque[int] = deque(maxlen=8)
+        """when what is not answered yet was asked"""
+        self._round_trip_heard_ns = 0
+        self._clock_ahead_ns: deque[int] = deque(maxlen=CLOCK_SAMPLES)
 
     def receive(self, datagram: bytes, now: Instant) -> bool:
         """Take a datagram; True if it brought a position."""
@@ -131,6 +191,15 @@ class AutopilotClient:
                     self.horizontal_accuracy_m = event.horizontal_accuracy_m
                 case wire.SystemHealth():
                     self.battery_percent = event.battery_percent
+                    self.sensors_health = event.sensors_health
+                case wire.HomePosition():
+                    self.home_altitude_amsl_m = event.altitude_amsl_m
+                case wire.ParameterValue():
+                    self.parameters.take(event.name, event.value)
+                case wire.TimeAnswer():
+                    self._time_answer(event, now)
+                case wire.SystemTime():
+                    self._clock_ahead_ns.append(event.unix_us * 1000 - now.fleet_ns)
                 case wire.CommandAnswer():
                     self._answer(event, now)
         return fresh
@@ -162,11 +231,16 @@ class AutopilotClient:
             if self.fleet_origin is not None:
                 self.frame = None
             self._queues.clear()
+            self.parameters.restart()
+            self._round_trips_ns.clear()
+            self._clock_ahead_ns.clear()
+            self.home_altitude_amsl_m = None
             self._set_up()
         elif event.boot_ms <= self.boot.last_boot_ms:
             self.counts["position repeated"] += 1
             return False
         made_ns = self.boot.arrived(event.boot_ms, now.monotonic_ns)
+        self._arrivals_ns.append(now.monotonic_ns)
         if self.frame is None:
             return False
         self.position_ns = made_ns
@@ -182,6 +256,14 @@ class AutopilotClient:
             self.counts["estimator origin moved"] += 1
         self.origin = origin
         self.frame = LocalFrame.from_origins(origin, self.fleet_origin)
+
+    def _time_answer(self, event: wire.TimeAnswer, now: Instant) -> None:
+        if event.asked_ns not in self._round_trips_open_ns:
+            self.counts["time answer to nothing asked"] += 1
+            return
+        self._round_trips_open_ns.remove(event.asked_ns)
+        self._round_trip_heard_ns = now.monotonic_ns
+        self._round_trips_ns.append(now.monotonic_ns - event.asked_ns)
 
     def _answer(self, event: wire.CommandAnswer, now: Instant) -> None:
         queue = self._queues.get(event.command)
@@ -255,7 +337,18 @@ class AutopilotClient:
                 queue[0].tries += 1
                 queue[0].next_ns = now.monotonic_ns + round(RETRY_S * 1e9)
                 out.append(queue[0].make())
+        if not self.armed:
+            out += self._preflight_due(now.monotonic_ns)
         return out
+
+    def _preflight_due(self, now_ns: int) -> list[bytes]:
+        """On the ground: the link's round trip once a second, and the parameters."""
+        out = []
+        if now_ns >= self._round_trip_asked_ns + ROUND_TRIP_PERIOD_NS:
+            self._round_trip_asked_ns = now_ns
+            self._round_trips_open_ns.append(now_ns)
+            out.append(self.link.time_request(now_ns))
+        return out + [self.link.read_parameter(name) for name in self.parameters.due(now_ns)]
 
     def next_deadline_ns(self) -> int:
         """When `due` next has something to say (monotonic ns)."""
@@ -263,6 +356,8 @@ class AutopilotClient:
         times += [queue[0].next_ns for queue in self._queues.values() if queue]
         if self.heartbeat_ns is not None and self.origin is None and self.fleet_origin is not None:
             times.append(self._next_origin_ns)
+        if self.heartbeat_ns is not None and not self.armed:
+            times += [self._round_trip_asked_ns + ROUND_TRIP_PERIOD_NS, self.parameters.next_deadline_ns()]
         return min(times)
 
     def position_age_s(self, now: Instant) -> float:
@@ -279,25 +374,39 @@ class AutopilotClient:
         p, v = self.position_ned_m, self.velocity_ned_m_s
         return Ned(p.north + v.north * age_s, p.east + v.east * age_s, p.down + v.down * age_s), v
 
-    def unready(self, now: Instant) -> list[str]:
-        """Why the vehicle may not take off; empty when it may."""
-        if self.heartbeat_ns is None:
-            return ["no heartbeat from the autopilot"]
-        reasons = []
-        if now.monotonic_ns - self.heartbeat_ns > HEARTBEAT_LIMIT_S * 1e9:
-            reasons.append(f"no heartbeat for {(now.monotonic_ns - self.heartbeat_ns) * 1e-9:.0f} s")
-        if self.autopilot_kind != wire.AUTOPILOT_PX4:
-            reasons.append(f"autopilot is no PX4 (MAV_AUTOPILOT {self.autopilot_kind})")
-        if self.vehicle_type not in wire.MULTICOPTERS:
-            reasons.append(f"vehicle is no multicopter (MAV_TYPE {self.vehicle_type})")
-        if self.frame is None:
-            reasons.append("estimator origin unknown")
-        elif self.state(now) is None:
-            reasons.append(f"no position within {POSITION_LIMIT_S} s")
-        wanted = ESTIMATOR_FLAGS_NEEDED
-        wanted |= ESTIMATOR_GLOBAL_FLAG if self.fleet_origin is not None else ESTIMATOR_RELATIVE_FLAG
-        if self.estimator_flags & wanted != wanted:
-            reasons.append(f"estimator not ready (flags {self.estimator_flags:#x}, needs {wanted:#x})")
-        elif not self.horizontal_accuracy_m <= ACCURACY_LIMIT_M:
-            reasons.append(f"position uncertain by {self.horizontal_accuracy_m:.1f} m, may be {ACCURACY_LIMIT_M:g} m")
-        return reasons
+    def round_trip_s(self, now: Instant) -> float | None:
+        """Median of the last round trips; None without an answer of late, where one is asked for."""
+        if not self._round_trips_ns:
+            return None
+        if not self.armed and now.monotonic_ns - self._round_trip_heard_ns > ROUND_TRIP_SILENCE_NS:
+            return None
+        return sorted(self._round_trips_ns)[len(self._round_trips_ns) // 2] * 1e-9
+
+    def position_rate_hz(self, now: Instant) -> float:
+        """Positions a second over the last two."""
+        since_ns = now.monotonic_ns - RATE_WINDOW_NS
+        return sum(t > since_ns for t in self._arrivals_ns) / (RATE_WINDOW_NS * 1e-9)
+
+    def facts(self, now: Instant) -> AutopilotFacts:
+        """What preflight looks at."""
+        heartbeat = self.heartbeat_ns
+        return AutopilotFacts(
+            heartbeat_age_s=None if heartbeat is None else (now.monotonic_ns - heartbeat) * 1e-9,
+            foreign_system_id=self.link.foreign_system_id,
+            autopilot_kind=self.autopilot_kind,
+            vehicle_type=self.vehicle_type,
+            estimator_flags=self.estimator_flags,
+            sensors_health=self.sensors_health,
+            horizontal_accuracy_m=self.horizontal_accuracy_m,
+            origin=self.origin,
+            home_altitude_amsl_m=self.home_altitude_amsl_m,
+            position_ned_m=None if self.frame is None or self.position_ns is None else self.position_ned_m,
+            position_age_s=self.position_age_s(now),
+            position_rate_hz=self.position_rate_hz(now),
+            battery_percent=self.battery_percent,
+            round_trip_s=self.round_trip_s(now),
+            # The least delayed of the last messages is nearest to the truth: delay makes the autopilot seem behind.
+            clock_ahead_s=max(self._clock_ahead_ns) * 1e-9 if self._clock_ahead_ns else None,
+            parameters=self.parameters.values,
+            missing=frozenset(self.parameters.missing),
+        )

@@ -193,6 +193,32 @@ class PeersTable(_Table):
     """multicast port by which a laptop's vehicles find each other; None: from the fleet's name"""
 
 
+class PreflightTable(_Table):
+    """What must be true before take-off."""
+
+    battery_min_percent: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)] = 30.0
+    """0: not looked at"""
+    position_rate_min_hz: Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)] = 10.0
+    round_trip_limit_s: Annotated[float, Field(gt=0, le=10, allow_inf_nan=False)] = 0.25
+    """companion to autopilot and back"""
+    clock_limit_s: Annotated[float, Field(gt=0, le=10, allow_inf_nan=False)] = 0.1
+    """between any two companions"""
+    autopilot_clock_limit_s: Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)] = 6.0
+    """between a companion and its autopilot; PX4 sets its clock by GPS only when it is off by 5 s"""
+    origin_limit_m: Positive = 1000.0
+    """estimators' origins from the fleet origin, and from each other"""
+    altitude_limit_m: Positive = 5.0
+    """a vehicle on its pad, and its home, from the fleet origin's altitude"""
+    altitude_spread_m: Positive = 3.0
+    """vehicles on their pads, and their homes, from each other"""
+    pad_limit_m: Positive = 10.0
+    """a vehicle from its own pad"""
+    offboard_loss_limit_s: Annotated[float, Field(gt=0, le=60, allow_inf_nan=False)] = 1.0
+    """the autopilot's COM_OF_LOSS_T"""
+    require_rc: bool = False
+    """whether every vehicle has a pilot with a transmitter"""
+
+
 class LaunchTable(_Table):
     """The pads: a grid about the fleet origin, for vehicles that name no pad."""
 
@@ -253,6 +279,7 @@ class FleetConfig(_Table):
     trigger: TriggerTable = TriggerTable()
     limits: LimitsTable = LimitsTable()
     peers: PeersTable = PeersTable()
+    preflight: PreflightTable = PreflightTable()
     launch: LaunchTable = LaunchTable()
     stub: StubTable = StubTable()
     vehicle: Annotated[tuple[VehicleTable, ...], Field(min_length=1, max_length=250)]
@@ -622,7 +649,7 @@ def _plan_faults(config: FleetConfig) -> Iterator[str]:
 
 _UNITS = {
     "_m_s3": "m/s^3", "_m_s2": "m/s^2", "_m_s": "m/s", "_deg_s": "deg/s", "_per_s": "1/s", "_s2": "s^2", "_deg": "deg",
-    "_m": "m", "_s": "s", "_hz": "Hz",
+    "_m": "m", "_s": "s", "_hz": "Hz", "_percent": "%",
 }  # fmt: skip
 
 

@@ -10,11 +10,15 @@ from dataclasses import dataclass
 from math import pi, radians
 from typing import Any, Protocol
 
+from pydantic import ValidationError
+
 from companion.config import FleetConfig
 from companion.core.frames import Ned
 from companion.core.plan import GotoLeg, Leg, Motion, TurnLeg, VelocityLeg, goto_duration_s, with_formation, with_legs
 from companion.core.values import ZERO
 from companion.errors import RefusedError, WireError
+from companion.preflight import Account, ClockReading
+from companion.preflight_fleet import Report, best_offset, fleet_report
 from companion.wire.peer import decode_motion, encode_motion
 
 COMMAND_LEAD_NS = 2_000_000_000
@@ -22,6 +26,10 @@ COMMAND_LEAD_NS = 2_000_000_000
 ANSWER_TIMEOUT_S = 5.0
 STATUS_TIMEOUT_S = 1.0
 RETRY_S = 0.5
+PREFLIGHT_TIMEOUT_S = 2.0
+CLOCK_ROUNDS_LEAST, CLOCK_ROUNDS_MOST = 3, 10
+CLOCK_SURE_SHARE = 0.25
+"""clocks are asked again until each is known to this share of their limit, or the rounds are over"""
 
 
 class Link(Protocol):
@@ -31,6 +39,19 @@ class Link(Protocol):
         self, vehicle_ids: Iterable[int], kind: str, payload: bytes, timeout_s: float, retry_s: float
     ) -> dict[int, bytes | None]:
         """Answers by vehicle id, None from the silent."""
+
+    def ask_timed(
+        self, vehicle_ids: Iterable[int], kind: str, payload: bytes, timeout_s: float, retry_s: float
+    ) -> dict[int, tuple[bytes, int, int] | None]:
+        """The same, with when each was asked and when it answered (UTC, ns)."""
+
+
+class PreflightError(RefusedError):
+    """The fleet is not fit to take off; `report` says why."""
+
+    def __init__(self, report: Report) -> None:
+        super().__init__("not fit for take-off:\n" + "\n".join(f"  {fault}" for fault in report.faults))
+        self.report = report
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,8 +104,30 @@ class Operator:
         return Answers(tuple(accepted), refused, tuple(silent))
 
     def take_off(self) -> Answers:
-        """Every vehicle arms and climbs; refused by a vehicle that is not ready, with its reasons."""
+        """Every vehicle arms and climbs; PreflightError if the fleet is not fit, and then nobody is asked to."""
+        report = self.preflight()
+        if not report.fit:
+            raise PreflightError(report)
         return self.command("takeoff")
+
+    def preflight(self) -> Report:
+        """Every vehicle's own checks, and what they say compared."""
+        answers = self.link.ask(self.ids, "preflight", b"", PREFLIGHT_TIMEOUT_S, RETRY_S)
+        accounts = {i: _account(a) for i, a in answers.items()}
+        boots = {i: {a.boot_id} for i, a in accounts.items() if a is not None}
+        readings: dict[int, list[tuple[int, int, int, int]]] = {i: [] for i in boots}
+        sure_s = CLOCK_SURE_SHARE * self.config.preflight.clock_limit_s
+        for k in range(CLOCK_ROUNDS_MOST if boots else 0):
+            for i, answer in self.link.ask_timed(boots, "preflight", b"clock", STATUS_TIMEOUT_S, RETRY_S).items():
+                if answer is not None and (reading := _clock_reading(answer[0])) is not None:
+                    readings[i].append((answer[1], reading.received_ns, reading.answered_ns, answer[2]))
+                    boots[i].add(reading.boot_id)
+            known = [best_offset(r) for r in readings.values()]
+            sure = all(o is not None and o.uncertain_s <= sure_s for o in known)
+            if sure and k + 1 >= CLOCK_ROUNDS_LEAST:
+                break
+        offsets = {i: best_offset(r) for i, r in readings.items()}
+        return fleet_report(self.config, accounts, offsets, {i: frozenset(b) for i, b in boots.items()})
 
     def land(self) -> Answers:
         """Every vehicle lands where it is."""
@@ -147,6 +190,21 @@ class Operator:
 
     def _send(self, motion: Motion) -> Answers:
         return self.command("motion", motion=json.loads(encode_motion(motion)))
+
+
+def _account(answer: bytes | None) -> Account | None:
+    """A vehicle's account; None from the silent, and from whoever answers anything else."""
+    try:
+        return None if answer is None else Account.model_validate_json(answer)
+    except ValidationError:
+        return None
+
+
+def _clock_reading(answer: bytes) -> ClockReading | None:
+    try:
+        return ClockReading.model_validate_json(answer)
+    except ValidationError:
+        return None
 
 
 def _object(answer: bytes | None) -> dict[str, Any] | None:

@@ -329,8 +329,37 @@ def status(
 
 
 @app.command()
+def preflight(
+    fleet: FleetFile = DEFAULT_FILE,
+    vehicles: Vehicles = None,
+    explain: Annotated[bool, typer.Option("--explain", help="Every check with its value and its limit.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Every check as JSON.")] = False,
+) -> None:
+    """Whether the fleet may take off: each vehicle's own checks, and what they say compared.
+
+    Exit status: 0 it may, 1 it may not (each fault is named), 2 wrong usage or configuration.
+    """
+    from companion.config import parse
+    from companion.io.loop import network_settings
+    from companion.io.zenoh_peers import OperatorLink
+    from companion.operate import Operator
+    from sim.view import show_preflight
+
+    config = parse(_tables(fleet, vehicles), fleet.name)
+    with OperatorLink(network_settings(config, None)) as link:
+        operator = Operator(config, link)
+        link.wait_alive(operator.ids, 2.0)
+        report = operator.preflight()
+    if as_json:
+        typer.echo(json.dumps(report.as_json()))
+    else:
+        show_preflight(report, explain)
+    raise typer.Exit(0 if report.fit else FAILED)
+
+
+@app.command()
 def takeoff(fleet: FleetFile = DEFAULT_FILE, vehicles: Vehicles = None) -> None:
-    """Arm and climb; a vehicle that is not ready refuses and says why."""
+    """Arm and climb, after a preflight across the fleet; whoever is at fault is named and nobody takes off."""
     _operate(fleet, vehicles, "take-off", lambda o: o.take_off())
 
 

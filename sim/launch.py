@@ -22,7 +22,7 @@ from companion.errors import CompanionError, RefusedError
 from companion.io.loop import network_settings
 from companion.io.recorder import read_recording
 from companion.io.zenoh_peers import OperatorLink
-from companion.operate import Operator
+from companion.operate import Answers, Operator, PreflightError
 from sim.faults import ScheduledFault, order_fault
 from sim.reference_loop import read_reference_loop
 from sim.stubs import TRUTH_DTYPE
@@ -205,9 +205,8 @@ def _fly(
     with OperatorLink(network_settings(config, None)) as link:
         operator = Operator(config, link)
         watch = _Watch(operator, processes, ids, show, began)
-        watch.until_ready(READY_TIMEOUT_S + READY_TIMEOUT_PER_VEHICLE_S * len(ids), interrupted)
-        takeoff_ns = time.time_ns()
-        answers = operator.take_off()
+        answers = watch.take_off(READY_TIMEOUT_S + READY_TIMEOUT_PER_VEHICLE_S * len(ids), interrupted)
+        takeoff_ns = watch.asked_ns
         if not answers.all_accepted:
             raise RefusedError(answers.sentence("take-off"))
         lost = watch.fly(options.duration_s, options.faults, interrupted)
@@ -288,6 +287,8 @@ class _Watch:
     began: float
     said: dict[int, dict[str, Any]] = field(default_factory=dict)
     """each vehicle's last account"""
+    asked_ns: int = 0
+    """when the take-off was last commanded (UTC)"""
 
     def _look(self, doing: str) -> dict[int, dict[str, Any] | None]:
         answers = self.operator.status()
@@ -300,22 +301,39 @@ class _Watch:
         status = {i: self.processes.exit_status(f"companion-{i}") for i in self.ids}
         return {i: s for i, s in status.items() if s is not None}
 
-    def until_ready(self, timeout_s: float, interrupted: Callable[[], bool]) -> None:
-        """Wait until every vehicle says that it may take off."""
+    def take_off(self, timeout_s: float, interrupted: Callable[[], bool]) -> Answers:
+        """Wait until every vehicle is ready, look at the fleet as a whole, and take off.
+
+        Raises PreflightError as soon as a fault shows that no waiting heals, and when the time is up.
+        """
         deadline = time.monotonic() + timeout_s
+        while True:
+            self._until_ready(deadline, interrupted)
+            self.asked_ns = time.time_ns()
+            try:
+                return self.operator.take_off()
+            except PreflightError as error:
+                if error.report.lasting or time.monotonic() > deadline:
+                    raise
+            time.sleep(0.3)
+
+    def _until_ready(self, deadline: float, interrupted: Callable[[], bool]) -> None:
+        """Wait until every vehicle says that it may take off, or one that it cannot, or the time is up."""
+        unfit_before = False
         while True:
             for name in self.processes.children:
                 if self.processes.exit_status(name) is not None:
                     raise CompanionError(self.processes.obituary(name, "before take-off"))
             answers = self._look("starting")
-            waiting = {i: ["silent"] if s is None else s["ready"] for i, s in answers.items()}
-            if all(not reasons for reasons in waiting.values()):
+            if all(s is not None and not s["ready"] for s in answers.values()):
                 return
             if interrupted():
                 raise CompanionError("interrupted before take-off")
-            if time.monotonic() > deadline:
-                named = "; ".join(f"vehicle {i}: {', '.join(r)}" for i, r in waiting.items() if r)
-                raise CompanionError(f"not ready after {timeout_s:.0f} s: {named}")
+            # Once all speak, so that all are named; seen twice, since what comes in at the start has no order.
+            unfit = all(s is not None for s in answers.values()) and any(s["unfit"] for s in answers.values() if s)
+            if (unfit and unfit_before) or time.monotonic() > deadline:
+                return
+            unfit_before = unfit
             time.sleep(0.3)
 
     def fly(

@@ -10,6 +10,8 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from companion.preflight import Check
+from companion.preflight_fleet import Report
 from sim.launch import Progress
 
 PLAIN_INTERVAL_S = 5.0
@@ -149,6 +151,34 @@ def show_status(vehicles: Vehicles) -> None:
     """The status of a fleet, once."""
     console = Console()
     console.print(status_table(vehicles, width=console.width))
+
+
+def show_preflight(report: Report, explain: bool) -> None:
+    """The faults as sentences, and every row if asked for."""
+    console = Console()
+    if explain:
+        table = Table(box=None, pad_edge=False, header_style="bold")
+        table.add_column("vehicle", justify="right")
+        table.add_column("check", no_wrap=True)
+        table.add_column("value", justify="right", overflow="fold")
+        table.add_column("limit", overflow="fold")
+        table.add_column("")
+        for c in report.checks:
+            table.add_row(
+                str(c.vehicle) if c.vehicle else "fleet", c.name, _value(c), c.limit,
+                Text("met", style="green") if c.met else Text("NOT MET", style="red"),
+            )  # fmt: skip
+        console.print(table)
+    for fault in report.faults:
+        console.print(fault, style="red", highlight=False, soft_wrap=True, markup=False)
+    fit = f"fit for take-off: {len(report.checks)} checks met"
+    console.print(fit if report.fit else f"not fit for take-off: {len(report.faults)} of {len(report.checks)} checks")
+
+
+def _value(check: Check) -> str:
+    if check.value is None:
+        return "-"
+    return f"{check.value:g}" if isinstance(check.value, float) else str(check.value)
 
 
 def show_summary(summary: Mapping[str, Any]) -> None:

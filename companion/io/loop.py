@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from companion.agent import Agent, Outputs
-from companion.config import FleetConfig
+from companion.config import STALE_AFTER, FleetConfig
 from companion.core.values import Instant
 from companion.errors import CompanionError
 from companion.io.clock import FleetClock
@@ -30,6 +30,7 @@ from companion.io.link import open_link
 from companion.io.recorder import Recorder
 from companion.io.traffic import tcp_bytes_sent
 from companion.io.zenoh_peers import PeerMessage, PeerNetwork, PeerNetworkSettings, PresenceChange, Request
+from companion.preflight import ClockReading
 
 TICK_RECORD = struct.Struct("<qqqff?6f")
 """body of the "tick" channel: lateness ns, sensor-to-setpoint latency ns (-1 for a timer's tick), CPU ns of the loop so
@@ -116,6 +117,10 @@ class Companion:
         self._stop_by_ns: int | None = None
         self._last_ns = 0
         self._second_ns = 0
+        self._own_id_heard = 0
+        self._own_id_ns: int | None = None
+        """when somebody else last spoke under this vehicle's id"""
+        self._own_id_memory_ns = round(STALE_AFTER * config.trigger.t_max_s * 1e9)
         self._driver_ns: int | None = None
         """when the position that the next tick follows from was received"""
         self.lateness_ns = 0
@@ -247,6 +252,9 @@ class Companion:
             self._record("input/command", now, request.payload)
             request.reply(self.agent.receive_command(request.payload, now))
             return
+        if request.kind == "preflight":
+            request.reply(self._preflight(request, now))
+            return
         status = self.agent.status(now)
         counters = self.network.counters
         status["lateness_ms"] = self.lateness_ns * 1e-6
@@ -260,7 +268,19 @@ class Companion:
         status["rejected"] |= {kind: count for kind, count in elsewhere.items() if count}
         request.reply(json.dumps(status).encode())
 
+    def _preflight(self, request: Request, now: Instant) -> bytes:
+        if request.payload == b"clock":
+            received_ns = self.clock.at(request.received_monotonic_ns).fleet_ns
+            answered_ns = self.clock.now().fleet_ns
+            reading = ClockReading(boot_id=self.boot_id, received_ns=received_ns, answered_ns=answered_ns)
+            return reading.model_dump_json().encode()
+        heard = self._own_id_ns is not None and now.monotonic_ns - self._own_id_ns < self._own_id_memory_ns
+        return self.agent.account(now, own_id_heard=heard).model_dump_json().encode()
+
     def _each_second(self, now_ns: int) -> None:
         self._second_ns = now_ns + 1_000_000_000
         self.clock.discipline(latched=self.agent.autopilot.armed)
+        own_id_heard = self.network.counters.own_id_heard
+        if own_id_heard > self._own_id_heard:
+            self._own_id_heard, self._own_id_ns = own_id_heard, now_ns
         self._record("traffic", self._instant(now_ns), TRAFFIC_RECORD.pack(tcp_bytes_sent()))

@@ -7,6 +7,7 @@ Keys, all below the fleet's namespace (its name):
     fleet/<id>/alive     liveliness token, there as long as the process lives
     fleet/<id>/command   queryable: an operator's command, answered by the vehicle's loop
     fleet/<id>/status    queryable: the vehicle's status
+    fleet/<id>/preflight queryable: its own checks and what a comparison needs; asked for "clock", its time alone
 
 Nothing here may hold up the control loop. Every put and reply uses congestion control DROP, `plan` as well: BLOCK would
 wait up to five seconds for one stalled link. A lost plan is healed by the agent, which repeats it, as it must anyway: a
@@ -58,7 +59,7 @@ STATE_TOPIC: Final = "state"
 PLAN_TOPIC: Final = "plan"
 TOPICS: Final = (STATE_TOPIC, PLAN_TOPIC)
 """what vehicles publish and hear from each other"""
-REQUEST_KINDS: Final = ("command", "status")
+REQUEST_KINDS: Final = ("command", "status", "preflight")
 
 QUEUE_CAPACITY: Final = 4096
 """events waiting for the loop: at 20 peers and 50 Hz each, four seconds"""
@@ -542,12 +543,20 @@ class OperatorLink:
 
         A vehicle may see a question more than once, so a command has to carry an id of its own.
         """
+        answers = self.ask_timed(vehicle_ids, kind, payload, timeout_s, retry_s)
+        return {i: None if answer is None else answer[0] for i, answer in answers.items()}
+
+    def ask_timed(
+        self, vehicle_ids: Iterable[int], kind: str, payload: bytes, timeout_s: float, retry_s: float
+    ) -> dict[int, tuple[bytes, int, int] | None]:
+        """The same, with when each was first asked and when it answered (this machine's UTC, ns)."""
         if not retry_s > 0:
             raise ValueError(f"retry_s must be > 0 s, got {retry_s}")
         session = self._opened()
-        answers: dict[int, bytes | None] = dict.fromkeys(vehicle_ids)
+        answers: dict[int, tuple[bytes, int, int] | None] = dict.fromkeys(vehicle_ids)
         silent = set(answers)
-        inbox: SimpleQueue[tuple[int, bytes]] = SimpleQueue()
+        asked_ns: dict[int, int] = {}
+        inbox: SimpleQueue[tuple[int, bytes, int]] = SimpleQueue()
         cancellation = zenoh.CancellationToken()
         now_s = time.monotonic()
         deadline_s = now_s + timeout_s
@@ -556,6 +565,7 @@ class OperatorLink:
             while silent and now_s < deadline_s:
                 if now_s >= next_round_s:
                     for vehicle_id in sorted(silent):
+                        asked_ns.setdefault(vehicle_id, time.time_ns())
                         session.get(
                             f"fleet/{vehicle_id}/{kind}",
                             Callback(_collector(vehicle_id, inbox), indirect=False),
@@ -568,12 +578,12 @@ class OperatorLink:
                         )
                     next_round_s = now_s + retry_s
                 try:
-                    vehicle_id, answer = inbox.get(timeout=max(0.0, min(next_round_s, deadline_s) - now_s))
+                    vehicle_id, answer, answered_ns = inbox.get(timeout=max(0.0, min(next_round_s, deadline_s) - now_s))
                 except Empty:
                     pass
                 else:
                     if vehicle_id in silent:
-                        answers[vehicle_id] = answer
+                        answers[vehicle_id] = answer, asked_ns[vehicle_id], answered_ns
                         silent.discard(vehicle_id)
                 now_s = time.monotonic()
         except zenoh.ZError as error:
@@ -588,10 +598,10 @@ class OperatorLink:
         return self._session
 
 
-def _collector(vehicle_id: int, inbox: SimpleQueue[tuple[int, bytes]]) -> Callable[[zenoh.Reply], None]:
+def _collector(vehicle_id: int, inbox: SimpleQueue[tuple[int, bytes, int]]) -> Callable[[zenoh.Reply], None]:
     def on_reply(reply: zenoh.Reply) -> None:
         if (sample := reply.ok) is not None:
-            inbox.put((vehicle_id, sample.payload.to_bytes()))
+            inbox.put((vehicle_id, sample.payload.to_bytes(), time.time_ns()))
 
     return on_reply
 

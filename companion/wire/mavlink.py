@@ -124,17 +124,49 @@ class CommandAnswer:
     result: int
 
 
+@dataclass(frozen=True, slots=True)
+class ParameterValue:
+    """PARAM_VALUE (22)."""
+
+    name: str
+    value: float | int
+
+
+@dataclass(frozen=True, slots=True)
+class TimeAnswer:
+    """TIMESYNC (111) in answer to a request of ours."""
+
+    asked_ns: int
+    """our time in the request, mirrored"""
+
+
+@dataclass(frozen=True, slots=True)
+class SystemTime:
+    """SYSTEM_TIME (2) of an autopilot that knows UTC."""
+
+    unix_us: int
+
+
+@dataclass(frozen=True, slots=True)
+class HomePosition:
+    """HOME_POSITION (242)."""
+
+    altitude_amsl_m: float
+
+
 Event = (
     Heartbeat | LocalPosition | GlobalOrigin | CurrentMode | LandedState | EstimatorHealth | SystemHealth
-    | CommandAnswer
+    | CommandAnswer | ParameterValue | TimeAnswer | SystemTime | HomePosition
 )  # fmt: skip
 
-_READ = frozenset({0, 1, 32, 49, 77, 230, 245, 436})
+_READ = frozenset({0, 1, 2, 22, 32, 49, 77, 111, 230, 242, 245, 436})
+UTC_KNOWN_US = 1_577_836_800_000_000
+"""2020: an autopilot's UTC before that is none"""
 ORIGIN_MESSAGE_ID = 49
 REQUEST_MESSAGE = mavlink.MAV_CMD_REQUEST_MESSAGE
 POSITION_MESSAGE_ID = 32
 POSITION_RATE_HZ = 50.0
-STREAMS_HZ = {POSITION_MESSAGE_ID: POSITION_RATE_HZ, 436: 20.0, 245: 5.0, 230: 1.0, 1: 1.0}
+STREAMS_HZ = {POSITION_MESSAGE_ID: POSITION_RATE_HZ, 436: 20.0, 245: 5.0, 230: 1.0, 1: 1.0, 2: 1.0, 242: 0.5}
 """what the companion asks for with SET_MESSAGE_INTERVAL"""
 STREAMS_OFF = (30, 31, 33, 105, 331, 111, 141, 132, 83, 85, 36, 74, 24, 87)
 """what a companion's link carries by default and nobody here reads"""
@@ -193,6 +225,8 @@ class MavlinkLink:
         self.system_id = system_id
         self.rejected: Counter[str] = Counter()
         self.not_read = 0
+        self.foreign_system_id: int | None = None
+        """of the autopilot that was last heard on this link under another system id"""
         self._out: Any = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=COMPANION_COMPONENT_ID)
         self._in: Any = mavlink.MAVLink(None)
         self._in.robust_parsing = True
@@ -232,6 +266,8 @@ class MavlinkLink:
             return None
         if message.get_srcSystem() != self.system_id or message.get_srcComponent() != AUTOPILOT_COMPONENT_ID:
             self.rejected["foreign system"] += 1
+            if _is_autopilot(message):
+                self.foreign_system_id = message.get_srcSystem()
             return None
         match message:
             case mavlink.MAVLink_local_position_ned_message():
@@ -265,6 +301,20 @@ class MavlinkLink:
                 if message.target_component not in (0, COMPANION_COMPONENT_ID):
                     return None
                 return CommandAnswer(message.command, message.result)
+            case mavlink.MAVLink_param_value_message():
+                if message.param_type not in (mavlink.MAV_PARAM_TYPE_INT32, mavlink.MAV_PARAM_TYPE_REAL32):
+                    return None  # `_HASH_CHECK`
+                value = parameter_value(message)
+                if not isfinite(value):
+                    self.rejected["not finite"] += 1
+                    return None
+                return ParameterValue(message.param_id.rstrip("\x00"), value)
+            case mavlink.MAVLink_timesync_message():
+                return TimeAnswer(message.ts1) if message.tc1 != 0 else None
+            case mavlink.MAVLink_system_time_message():
+                return SystemTime(message.time_unix_usec) if message.time_unix_usec > UTC_KNOWN_US else None
+            case mavlink.MAVLink_home_position_message():
+                return HomePosition(message.altitude * 1e-3)
         self.not_read += 1
         return None
 
@@ -297,11 +347,29 @@ class MavlinkLink:
             mavlink.MAVLink_command_long_message(self.system_id, AUTOPILOT_COMPONENT_ID, command, 0, *values)
         )
 
+    def read_parameter(self, name: str) -> bytes:
+        """PARAM_REQUEST_READ (20) by name."""
+        return self._pack(
+            mavlink.MAVLink_param_request_read_message(self.system_id, AUTOPILOT_COMPONENT_ID, name.encode(), -1)
+        )
+
+    def time_request(self, now_ns: int) -> bytes:
+        """TIMESYNC (111): the autopilot mirrors our time."""
+        return self._pack(mavlink.MAVLink_timesync_message(0, now_ns))
+
     def _pack(self, message: Any) -> bytes:
         data: bytes = bytes(message.pack(self._out))
         # pack() leaves the sequence as it is; gaps in it are how the other side counts losses.
         self._out.seq = (self._out.seq + 1) % 256
         return data
+
+
+def _is_autopilot(message: Any) -> bool:
+    return (
+        isinstance(message, mavlink.MAVLink_heartbeat_message)
+        and message.get_srcComponent() == AUTOPILOT_COMPONENT_ID
+        and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID
+    )
 
 
 def parameter_value(message: Any) -> float | int:
