@@ -26,7 +26,7 @@ COMMAND_LEAD_NS = 2_000_000_000
 ANSWER_TIMEOUT_S = 5.0
 STATUS_TIMEOUT_S = 1.0
 RETRY_S = 0.5
-PREFLIGHT_TIMEOUT_S = 2.0
+PREFLIGHT_TIMEOUT_S = 3.0
 CLOCK_ROUNDS_LEAST, CLOCK_ROUNDS_MOST = 3, 10
 CLOCK_SURE_SHARE = 0.25
 """clocks are asked again until each is known to this share of their limit, or the rounds are over"""

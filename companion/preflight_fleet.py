@@ -181,7 +181,7 @@ def _references(config: FleetConfig, heard: Mapping[int, Account]) -> Iterator[C
     if config.fleet.frame == "local":
         return
     standing = {i: a for i, a in heard.items() if not a.flying and a.revision == 0}
-    heights = {i: -a.position_ned_m[2] for i, a in standing.items() if a.position_ned_m is not None}
+    heights = {i: 0.0 - a.position_ned_m[2] for i, a in standing.items() if a.position_ned_m is not None}
     homes = {i: a.home_altitude_amsl_m for i, a in standing.items() if a.home_altitude_amsl_m is not None}
     for name, values in (("start altitudes", heights), ("home altitudes", homes)):
         spread = max(values.values(), default=0.0) - min(values.values(), default=0.0)

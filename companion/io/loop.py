@@ -28,6 +28,7 @@ from companion.errors import CompanionError
 from companion.io.clock import FleetClock
 from companion.io.link import open_link
 from companion.io.recorder import Recorder
+from companion.io.systemd import Notifier
 from companion.io.traffic import tcp_bytes_sent
 from companion.io.zenoh_peers import PeerMessage, PeerNetwork, PeerNetworkSettings, PresenceChange, Request
 from companion.preflight import ClockReading
@@ -97,6 +98,8 @@ class Companion:
         self._resources = ExitStack()
         self._resources.callback(self._wake_read.close)
         self._resources.callback(self._wake_write.close)
+        self._notifier = Notifier()
+        self._resources.callback(self._notifier.close)
         try:
             self.link = open_link(self.agent.vehicle)
             self._resources.callback(self.link.close)
@@ -141,6 +144,7 @@ class Companion:
             self._record("input/stop", now, b"")
             self.agent.stop(now)
             self._stop_by_ns = stop_by_ns
+            self._notifier.stopping()
         self._stop_by_ns = min(self._stop_by_ns, stop_by_ns)
 
     def run(self) -> int:
@@ -158,6 +162,7 @@ class Companion:
         gc.freeze()
         sys.setswitchinterval(0.0005)
         with _signals(ask):
+            self._notifier.ready()
             while True:
                 deadline_ns = min(self.agent.next_deadline_ns(), self._second_ns)
                 ready, _, _ = select.select(waiting, [], [], max(deadline_ns - time.monotonic_ns(), 0) * 1e-9)
@@ -225,6 +230,7 @@ class Companion:
         sent_ns = time.monotonic_ns()
         for topic, payload in out.peers:
             self.network.publish(topic, payload)
+        self._notifier.turned(sent_ns)
         self._after(out, now, sent_ns, deadline_ns)
 
     def _after(self, out: Outputs, now: Instant, sent_ns: int, deadline_ns: int) -> None:

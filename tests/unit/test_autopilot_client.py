@@ -1,5 +1,6 @@
 """One autopilot as its companion sees it: clock, requests, origin, readiness."""
 
+import struct
 from typing import Any
 
 import pytest
@@ -7,9 +8,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import development as dialect
 
-from companion.autopilot import LATENCY_WINDOW_NS, RETRY_S, TRIES, AutopilotClient, BootClock
+from companion.autopilot import (
+    LATENCY_WINDOW_NS,
+    PARAMETER_PERIOD_NS,
+    PARAMETER_TRIES,
+    PARAMETERS_AT_ONCE,
+    RETRY_S,
+    TRIES,
+    AutopilotClient,
+    BootClock,
+)
 from companion.core.frames import Geodetic, Ned, ned_to_geodetic
 from companion.core.values import Instant
+from companion.preflight import PARAMETERS
 from companion.wire import mavlink as wire
 from companion.wire.mavlink import MavlinkLink, Px4Mode
 
@@ -144,7 +155,8 @@ def test_a_reboot_forgets_clock_and_origin_and_sets_the_streams_up_anew() -> Non
     before = len(one.times_of(511))
     assert not one.position(110.0, boot_ms=2_000)
     assert one.client.counts["autopilot reboot"] == 1
-    assert "estimator origin unknown" in one.client.unready(at(110.0))
+    assert one.client.facts(at(110.0)).origin is None
+    assert one.client.facts(at(110.0)).position_ned_m is None
     one.origin(110.1)
     assert one.position(110.2, boot_ms=2_200)
     one.hear(110.2)
@@ -340,47 +352,162 @@ def test_in_a_local_frame_the_autopilots_frame_is_the_fleets() -> None:
     assert one.times_of(512) == []
 
 
-# -- readiness ---------------------------------------------------------------------------------------------------------
+# -- facts -------------------------------------------------------------------------------------------------------------
 
 
-def test_a_ready_autopilot_gives_no_reason() -> None:
-    assert ready().client.unready(at(10.1)) == []
+def test_the_facts_are_what_the_autopilot_has_said() -> None:
+    assert px4().client.facts(at(0.0)).heartbeat_age_s is None
+    one = ready()
+    one.origin(10.0, Ned(3.0, 4.0, 0.0))
+    one.says(dialect.MAVLink_sys_status_message(0, 0, 1 << 16, 0, 0, 0, 55, 0, 0, 0, 0, 0, 0), 10.0)
+    one.says(dialect.MAVLink_home_position_message(0, 0, 489_500, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0), 10.0)
+    facts = one.client.facts(at(10.4))
+    assert facts.heartbeat_age_s == pytest.approx(0.4)
+    assert facts.position_age_s == pytest.approx(0.4, abs=0.002)
+    assert (facts.autopilot_kind, facts.vehicle_type) == (12, 2)
+    assert (facts.estimator_flags, facts.horizontal_accuracy_m) == (ESTIMATOR_OK, 0.5)
+    assert (facts.battery_percent, facts.sensors_health) == (55, 1 << 16)
+    assert facts.home_altitude_amsl_m == pytest.approx(489.5)
+    assert facts.origin is not None
+    assert facts.clock_ahead_s is None
 
 
-def test_readiness_names_each_reason_by_itself() -> None:
-    assert px4().client.unready(at(0.0)) == ["no heartbeat from the autopilot"]
-    silent = ready()
-    silent.position(13.4)
-    assert silent.client.unready(at(13.5)) == ["no heartbeat for 4 s"]
-    other = ready()
-    other.heartbeat(10.0, kind=3)
-    assert other.client.unready(at(10.1)) == ["autopilot is no PX4 (MAV_AUTOPILOT 3)"]
-    plane = ready()
-    plane.heartbeat(10.0, type_=1)
-    assert plane.client.unready(at(10.1)) == ["vehicle is no multicopter (MAV_TYPE 1)"]
-    nowhere = px4()
-    nowhere.heartbeat(10.0)
-    nowhere.says(dialect.MAVLink_estimator_status_message(0, ESTIMATOR_OK, 0, 0, 0, 0, 0, 0, 0.5, 0.5), 10.0)
-    assert nowhere.client.unready(at(10.1)) == ["estimator origin unknown"]
-    stale = ready()
-    assert stale.client.unready(at(10.6)) == ["no position within 0.5 s"]
-    unsure = ready()
-    unsure.says(dialect.MAVLink_estimator_status_message(0, 1 | 2 | 4 | 8, 0, 0, 0, 0, 0, 0, 0.5, 0.5), 10.0)
-    assert unsure.client.unready(at(10.1)) == ["estimator not ready (flags 0xf, needs 0x17)"]
+def test_positions_are_counted_over_the_last_two_seconds() -> None:
+    one = ready(10.0)
+    for k in range(1, 151):
+        one.position(10.0 + 0.02 * k)
+    assert one.client.facts(at(13.0)).position_rate_hz == pytest.approx(50.0, abs=0.5)
+    assert one.client.facts(at(14.0)).position_rate_hz == pytest.approx(25.0, abs=0.5)
+    assert one.client.facts(at(15.1)).position_rate_hz == 0.0
 
 
-def test_reasons_are_told_together() -> None:
+def test_an_autopilot_of_another_system_id_is_named() -> None:
     one = px4()
-    one.heartbeat(0.0, kind=3)
-    assert len(one.client.unready(at(5.0))) == 4
+    one.mav.srcSystem = 9
+    one.heartbeat(1.0)
+    assert one.client.facts(at(1.0)).foreign_system_id == 9
+    assert one.client.facts(at(1.0)).heartbeat_age_s is None
 
 
-def test_a_local_frame_needs_a_relative_position_only() -> None:
-    one = px4(None)
-    one.heartbeat(10.0)
-    one.position(10.0)
-    one.says(dialect.MAVLink_estimator_status_message(0, 1 | 2 | 4 | 8, 0, 0, 0, 0, 0, 0, 0.5, 0.5), 10.0)
-    assert one.client.unready(at(10.1)) == []
+# -- parameters --------------------------------------------------------------------------------------------------------
+
+
+def asked_for(messages: list[Any]) -> list[str]:
+    return [m.param_id for m in messages if m.get_type() == "PARAM_REQUEST_READ"]
+
+
+def tells(one: Px4, name: str, value: float | int, seconds: float) -> None:
+    whole = isinstance(value, int)
+    wire_value = struct.unpack("<f", struct.pack("<i", value))[0] if whole else value
+    kind = 6 if whole else 9
+    one.says(dialect.MAVLink_param_value_message(name.encode(), wire_value, kind, 900, 1), seconds)
+
+
+def answered(one: Px4, start_s: float, end_s: float, silent: frozenset[str] = frozenset()) -> list[tuple[float, str]]:
+    """Let the client ask; every request is answered a millisecond later, INT32 for whole values."""
+    asked = []
+    for k in range(round((end_s - start_s) / 0.01)):
+        now = start_s + 0.01 * k
+        for name in asked_for(one.hear(now)):
+            asked.append((now, name))
+            if name not in silent:
+                tells(one, name, 1.0 if name.startswith(("MPC", "COM_OF")) else 4, now + 0.001)
+    return asked
+
+
+def test_all_parameters_are_read_within_a_second_a_few_at_a_time() -> None:
+    one = ready(10.0)
+    asked = answered(one, 10.0, 11.0)
+    assert [name for _, name in asked] == list(PARAMETERS)
+    assert set(one.client.facts(at(11.0)).parameters) == set(PARAMETERS)
+    assert one.client.facts(at(11.0)).parameters["COM_OBL_RC_ACT"] == 4
+    assert max(sum(t == now for t, _ in asked) for now, _ in asked) <= PARAMETERS_AT_ONCE
+
+
+def test_whole_parameters_come_bytewise() -> None:
+    one = ready(10.0)
+    tells(one, "COM_RCL_EXCEPT", 4, 10.0)
+    tells(one, "NAV_RCL_ACT", -1, 10.0)
+    tells(one, "COM_OF_LOSS_T", 0.5, 10.0)
+    tells(one, "SYS_AUTOSTART", 4001, 10.0)
+    parameters = one.client.facts(at(10.0)).parameters
+    assert parameters == {"COM_RCL_EXCEPT": 4, "NAV_RCL_ACT": -1, "COM_OF_LOSS_T": 0.5}
+
+
+def test_a_parameter_that_never_comes_is_missing_and_the_others_are_read() -> None:
+    one = ready(10.0)
+    asked = answered(one, 10.0, 14.5, frozenset({"GF_ACTION"}))
+    times = [t for t, name in asked if name == "GF_ACTION"]
+    assert times == pytest.approx([times[0] + RETRY_S * k for k in range(PARAMETER_TRIES)], abs=0.011)
+    facts = one.client.facts(at(14.5))
+    assert facts.missing == {"GF_ACTION"}
+    assert set(facts.parameters) == set(PARAMETERS) - {"GF_ACTION"}
+    tells(one, "GF_ACTION", 2, 14.6)
+    assert one.client.facts(at(14.6)).missing == frozenset()
+
+
+def test_parameters_are_read_anew_on_the_ground_and_left_alone_in_flight() -> None:
+    one = ready(10.0)
+    answered(one, 10.0, 12.0)
+    again = answered(one, 12.0, 20.0)
+    assert [name for _, name in again] == list(PARAMETERS)
+    assert again[0][0] >= 10.0 + PARAMETER_PERIOD_NS * 1e-9
+    one.heartbeat(20.0, armed=True)
+    flown = [m.get_type() for k in range(1000) for m in one.hear(20.0 + 0.01 * k)]
+    assert {"PARAM_REQUEST_READ", "TIMESYNC"}.isdisjoint(flown)
+    one.heartbeat(30.0)
+    assert len(answered(one, 30.0, 31.0)) == len(PARAMETERS)
+
+
+def test_a_reboot_forgets_the_parameters() -> None:
+    one = ready(100.0)
+    answered(one, 100.0, 101.0)
+    one.position(110.0, boot_ms=2_000)
+    assert one.client.facts(at(110.0)).parameters == {}
+
+
+# -- round trip and the autopilot's clock ------------------------------------------------------------------------------
+
+
+def time_request(messages: list[Any]) -> int | None:
+    return next((m.ts1 for m in messages if m.get_type() == "TIMESYNC"), None)
+
+
+def test_the_round_trip_is_the_median_of_the_last_answers() -> None:
+    one = ready(10.0)
+    for k, delay_s in enumerate((0.010, 0.500, 0.012, 0.011, 0.013, 0.011)):
+        asked_ns = time_request(one.hear(11.0 + k))
+        assert asked_ns == at(11.0 + k).monotonic_ns
+        one.says(dialect.MAVLink_timesync_message(5_000_000_000, asked_ns), 11.0 + k + delay_s)
+    trip = one.client.facts(at(16.5)).round_trip_s
+    assert trip == pytest.approx(0.012)
+    assert one.client.facts(at(20.0)).round_trip_s is None, "no answer of late"
+
+
+def test_a_time_answer_counts_once_and_only_if_it_was_asked_for() -> None:
+    one = ready(10.0)
+    asked_ns = time_request(one.hear(11.0))
+    one.says(dialect.MAVLink_timesync_message(0, 13_332_000_000), 11.0)
+    assert one.client.facts(at(11.0)).round_trip_s is None, "the autopilot's own request is none"
+    one.says(dialect.MAVLink_timesync_message(5, 10_999_000_000), 11.0)
+    one.says(dialect.MAVLink_timesync_message(5, asked_ns), 11.1)
+    one.says(dialect.MAVLink_timesync_message(5, asked_ns), 11.9)
+    assert one.client.facts(at(12.0)).round_trip_s == pytest.approx(0.1)
+    assert one.client.counts["time answer to nothing asked"] == 2
+
+
+def test_the_autopilots_clock_is_read_from_its_least_delayed_message() -> None:
+    one = ready(10.0)
+    for k, delay_s in enumerate((0.3, 0.002, 0.1)):
+        made_us = at(11.0 + k).fleet_ns // 1000 + 1_500_000
+        one.says(dialect.MAVLink_system_time_message(made_us, 1000), 11.0 + k + delay_s)
+    assert one.client.facts(at(14.0)).clock_ahead_s == pytest.approx(1.498, abs=0.001)
+
+
+def test_an_autopilot_without_utc_has_no_clock() -> None:
+    one = ready(10.0)
+    one.says(dialect.MAVLink_system_time_message(14_000_000, 14_000), 11.0)
+    assert one.client.facts(at(11.0)).clock_ahead_s is None
 
 
 def test_state_of_the_autopilot_is_what_it_last_said() -> None:

@@ -12,7 +12,16 @@ from companion.config import FleetConfig, load
 from companion.core.frames import Ned
 from companion.core.plan import GotoLeg, Motion, TurnLeg, VelocityLeg, with_formation, with_legs
 from companion.errors import ConfigError, RefusedError
-from companion.operate import COMMAND_LEAD_NS, Answers, Operator, turn_leg, velocity_leg
+from companion.operate import (
+    CLOCK_ROUNDS_LEAST,
+    COMMAND_LEAD_NS,
+    Answers,
+    Operator,
+    PreflightError,
+    turn_leg,
+    velocity_leg,
+)
+from companion.preflight import Account, Check, assignment_hash
 from companion.wire.peer import decode_motion, encode_motion
 
 CONFIG = load(Path(__file__).resolve().parents[2] / "fleet.toml", lambda t: t.update(vehicle=t["vehicle"][:4]))
@@ -34,6 +43,10 @@ class Fleet:
     """None: silent"""
     refusals: dict[int, str] = field(default_factory=dict)
     came: list[tuple[int, str, bytes]] = field(default_factory=list)
+    checks: dict[int, tuple[Check, ...]] = field(default_factory=dict)
+    """vehicle id -> the rows of its own preflight"""
+    ahead_s: dict[int, float] = field(default_factory=dict)
+    """vehicle id -> its clock against the operator's"""
 
     def ask(
         self, vehicle_ids: Iterable[int], kind: str, payload: bytes, timeout_s: float, retry_s: float
@@ -45,12 +58,34 @@ class Fleet:
             self.came.append((i, kind, payload))
             if motion is None:
                 answers[i] = None
+            elif kind == "preflight":
+                answers[i] = self.account(i)
             elif kind == "status":
                 answers[i] = json.dumps({"vehicle": i, "motion": json.loads(encode_motion(motion))}).encode()
             else:
                 reason = self.refusals.get(i)
                 answers[i] = json.dumps({"vehicle": i, "accepted": reason is None, "reason": reason}).encode()
         return answers
+
+    def ask_timed(
+        self, vehicle_ids: Iterable[int], kind: str, payload: bytes, timeout_s: float, retry_s: float
+    ) -> dict[int, tuple[bytes, int, int] | None]:
+        answers: dict[int, tuple[bytes, int, int] | None] = {}
+        for i in vehicle_ids:
+            self.came.append((i, kind, payload))
+            there_ns = NOW_NS + round(self.ahead_s.get(i, 0.0) * 1e9) + 1_000_000
+            reading = {"boot_id": 100 + i, "received_ns": there_ns, "answered_ns": there_ns}
+            answers[i] = json.dumps(reading).encode(), NOW_NS, NOW_NS + 2_000_000
+        return answers
+
+    def account(self, i: int) -> bytes:
+        vehicle = CONFIG.by_id(i)
+        here = (vehicle.pad_north_m, vehicle.pad_east_m, 0.0)
+        return Account(
+            vehicle=i, boot_id=100 + i, system_id=i, configuration=CONFIG.shared_hash,
+            assignment=assignment_hash(CONFIG), flying=False, revision=0, position_ned_m=here, slot_ned_m=here,
+            origin_ned_m=here, home_altitude_amsl_m=488.0, checks=self.checks.get(i, ()),
+        ).model_dump_json().encode()  # fmt: skip
 
     def commands(self) -> list[bytes]:
         return [payload for _, kind, payload in self.came if kind == "command"]
@@ -71,9 +106,31 @@ def test_every_vehicle_is_sent_the_same_bytes_and_all_accept() -> None:
     link = fleet()
     answers = Operator(CONFIG, link).take_off()
     assert answers.all_accepted
-    assert [i for i, _, _ in link.came] == [1, 2, 3, 4]
+    assert [i for i, kind, _ in link.came if kind == "command"] == [1, 2, 3, 4]
     assert {json.loads(p)["verb"] for p in link.commands()} == {"takeoff"}
     assert len(set(link.commands())) == 1
+
+
+def test_nobody_is_told_to_take_off_unless_the_whole_fleet_is_fit() -> None:
+    link = fleet()
+    link.motions[4] = None
+    link.ahead_s[3] = 0.4
+    link.checks[2] = (Check("GF_ACTION", 4, "0 or 1", False, "GF_ACTION is 4", lasting=True, vehicle=2),)
+    with pytest.raises(PreflightError) as refused:
+        Operator(CONFIG, link).take_off()
+    assert link.commands() == []
+    told = str(refused.value).splitlines()
+    assert told == [
+        "not fit for take-off:", "  not heard: vehicle 4", "  vehicle 2: GF_ACTION is 4",
+        "  vehicle 3: its clock is 0.400 s from vehicle 1, 2's, may be 0.1 s",
+    ]  # fmt: skip
+    assert refused.value.report.lasting
+
+
+def test_a_fit_fleet_is_asked_for_its_clocks_a_few_times() -> None:
+    link = fleet()
+    assert Operator(CONFIG, link).preflight().fit
+    assert len([p for i, kind, p in link.came if i == 1 and p == b"clock"]) == CLOCK_ROUNDS_LEAST
 
 
 def test_refusals_and_silence_are_told_by_vehicle() -> None:
