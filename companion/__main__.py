@@ -1,5 +1,6 @@
 """Command `companion`: one vehicle's companion process."""
 
+import json
 import os
 import sys
 from importlib.metadata import version
@@ -17,6 +18,7 @@ app = typer.Typer(
 )
 USAGE_ERROR = 2
 DIFFERENT = 1
+"""a replay that differs, a check that is not met"""
 
 
 @app.command()
@@ -47,6 +49,39 @@ def run(
     finally:
         companion.close()
     raise typer.Exit(status)
+
+
+@app.command()
+def check(
+    vehicle: Annotated[int, typer.Option(min=1, max=250, help="This vehicle's id in fleet.toml.")],
+    fleet: Annotated[Path, typer.Option(help="The fleet's configuration.")] = Path("fleet.toml"),
+    seconds: Annotated[float, typer.Option(min=1, max=600, help="How long to listen to the autopilot.")] = 6.0,
+    folder: Annotated[Path, typer.Option(help="Where recordings will go.")] = Path(),
+    as_json: Annotated[bool, typer.Option("--json", help="Every row as JSON.")] = False,
+) -> None:
+    """Look the companion computer over: link, autopilot and its parameters, clock, network, disk. Flies nothing.
+
+    Needs the vehicle's link for itself: stop its companion first. Exit status: 0 all met, 1 a row is not met, 2 wrong
+    usage or configuration.
+    """
+    from companion.io.check import hardware_checks
+    from companion.preflight import as_json as row_json
+    from companion.preflight import unmet
+
+    config = load(fleet)
+    rows = []
+    for row in hardware_checks(config, config.by_id(vehicle), seconds, folder):
+        rows.append(row)
+        if not as_json:
+            value = "-" if row.value is None else row.value
+            typer.echo(f"{'ok' if row.met else 'FAULT':5}  {row.name:20}  {value!s:>20}  {row.limit}")
+    faults = unmet(rows)
+    if as_json:
+        typer.echo(json.dumps({"fit": not faults, "checks": [row_json(r) for r in rows]}))
+    else:
+        for fault in faults:
+            typer.echo(fault.says)
+    raise typer.Exit(DIFFERENT if faults else 0)
 
 
 @app.command()

@@ -305,7 +305,7 @@ def _parameter_checks(facts: AutopilotFacts, config: FleetConfig) -> Iterator[Ch
                 says = f"{name} is {value:g}, must have {rule.limit[4:]}: {rule.why}"
             yield Check(name, tidy(value), rule.limit, met, says, lasting=True)
         elif name in facts.missing:
-            yield Check(name, None, rule.limit, False, f"{name} cannot be read", lasting=True)
+            yield Check(name, None, rule.limit, False, f"{name} cannot be read")
         else:
             waiting.append(name)
     if waiting:

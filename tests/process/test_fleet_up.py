@@ -561,8 +561,8 @@ def test_fleets_of_different_names_do_not_hear_each_other_on_one_scouting_port(s
 def test_take_off_is_refused_while_a_vehicle_is_missing(single: Single) -> None:
     assert single.refused is not None
     assert single.refused.returncode == 1
-    assert "vehicle 1 refused: not heard: vehicle 3" in single.refused.stdout
-    assert "silent: vehicle 3" in single.refused.stdout
+    assert "vehicle 1: not heard: vehicle 3" in single.refused.stderr
+    assert "\n  not heard: vehicle 3\n" in single.refused.stderr
 
 
 def test_a_companion_that_comes_late_flies_with_the_others(single: Single) -> None:
