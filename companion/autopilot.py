@@ -382,7 +382,7 @@ class AutopilotClient:
             return None
         return sorted(self._round_trips_ns)[len(self._round_trips_ns) // 2] * 1e-9
 
-    def position_rate_hz(self, now: Instant) -> float:
+    def positions_heard_hz(self, now: Instant) -> float:
         """Positions a second over the last two."""
         since_ns = now.monotonic_ns - RATE_WINDOW_NS
         return sum(t > since_ns for t in self._arrivals_ns) / (RATE_WINDOW_NS * 1e-9)
@@ -402,7 +402,7 @@ class AutopilotClient:
             home_altitude_amsl_m=self.home_altitude_amsl_m,
             position_ned_m=None if self.frame is None or self.position_ns is None else self.position_ned_m,
             position_age_s=self.position_age_s(now),
-            position_rate_hz=self.position_rate_hz(now),
+            position_rate_hz=self.positions_heard_hz(now),
             battery_percent=self.battery_percent,
             round_trip_s=self.round_trip_s(now),
             # The least delayed of the last messages is nearest to the truth: delay makes the autopilot seem behind.

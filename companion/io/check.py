@@ -63,9 +63,8 @@ def _autopilot(config: FleetConfig, vehicle: Vehicle, seconds: float) -> Iterato
         return
     try:
         yield Check("link", vehicle.mavlink, "opens", True, "")
-        client = AutopilotClient(
-            MavlinkLink(vehicle.system_id), config.origin if config.fleet.frame == "global" else None
-        )
+        origin = config.origin if config.fleet.frame == "global" else None
+        client = AutopilotClient(MavlinkLink(vehicle.system_id), origin, config.limits.control_rate_hz)
         clock = FleetClock()
         received = listen(link, client, clock, seconds)
         yield Check("bytes", received, "> 0", received > 0, f"nothing came on {vehicle.mavlink} in {seconds:g} s")
