@@ -21,6 +21,7 @@ from companion.io.link import SERIAL_UNSENT_MOST, SerialLink
 from companion.wire.mavlink import FrameSplitter
 from sim.autopilot import Autopilot
 from sim.dynamics import GustParameters, NoiseParameters
+from sim.stub_fleet import FLEET_PARAMETERS
 
 pytestmark = pytest.mark.process
 BAUD = 921600
@@ -131,12 +132,16 @@ def serve(autopilot: Autopilot, ours: int, over: threading.Event) -> None:
 
 def test_a_vehicle_flies_over_a_serial_line(tmp_path: Path) -> None:
     with line() as (ours, device):
-        fleet = make_fleet(tmp_path, 1, vehicle=[{"id": 1, "mavlink": f"serial://{device}:{BAUD}"}])
+        fleet = make_fleet(
+            tmp_path, 1, vehicle=[{"id": 1, "mavlink": f"serial://{device}:{BAUD}"}],
+            preflight={"offboard_loss_limit_s": dict(QUICK)["COM_OF_LOSS_T"]},
+        )  # fmt: skip
         now_ns = time.monotonic_ns()
         autopilot = Autopilot(
             system_id=1, boot_ns=now_ns, utc_offset_ns=time.time_ns() - now_ns, fleet_origin=fleet.config.origin,
             home_ned_m=Ned(0.0, 0.0, 0.0), gust=GustParameters(sigma_m_s2=0.0),
-            noise=NoiseParameters(position_sigma_m=0.0, velocity_sigma_m_s=0.0), parameters=dict(QUICK),
+            noise=NoiseParameters(position_sigma_m=0.0, velocity_sigma_m_s=0.0),
+            parameters=dict(FLEET_PARAMETERS + QUICK),
         )  # fmt: skip
         over = threading.Event()
         thread = threading.Thread(target=serve, args=(autopilot, ours, over))

@@ -160,7 +160,9 @@ def test_external_autopilots_fly_and_are_judged_by_their_own_estimates(tmp_path:
     try:
         for v in fleet.config.vehicles:
             home = ned_to_geodetic(Ned(v.pad_north_m, v.pad_east_m, 0.0), fleet.config.origin)
-            parameters = {"COM_OBL_RC_ACT": 4, "COM_RC_IN_MODE": 4, "COM_RCL_EXCEPT": 4, "SDLOG_MODE": -1}
+            parameters = {
+                "COM_OBL_RC_ACT": 4, "COM_RC_OVERRIDE": 3, "COM_RC_IN_MODE": 4, "COM_RCL_EXCEPT": 4, "SDLOG_MODE": -1,
+            }  # fmt: skip
             instances.append(Px4Instance(v.instance, home, build, tmp_path / f"px4-{v.id}", parameters))
         with flying(fleet, build, "--autopilot", "external") as flight:
             assert flight.up.wait(200.0) == 0, flight.up.out + flight.up.err
