@@ -28,6 +28,7 @@ from companion.core.plan import (
     with_formation,
     with_legs,
 )
+from companion.core.route import first_breach, only_stops
 from companion.core.safety import SafetyFilter
 from companion.core.trigger import exceeds, switching_exceeds
 from companion.core.values import (
@@ -352,6 +353,9 @@ class Agent:
         fastest = top_speed_m_s(motion)
         if not fastest <= self.config.limits.speed_max_m_s:
             return f"its centre flies at more than {self.config.limits.speed_max_m_s:g} m/s, at {fastest:.1f} m/s"
+        breach = first_breach(motion, self.config.geofence)
+        if breach is not None and not only_stops(motion, self.programme.newest):
+            return f"it leads outside the fence, {breach.sentence()}"
         if motion.shape == "pads":
             same = motion.slots == self.config.first_motion.slots
             return None if same else "its pads are not this vehicle's; do the configurations differ?"

@@ -20,13 +20,25 @@ import annotated_types
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
 
+from companion.core.fence import Fence
 from companion.core.formation import SHAPES, Slots, centred, minimum_distance, rotated, shape_slots
 from companion.core.frames import Geodetic, Ned
 from companion.core.hold import HoldKind
 from companion.core.law import Gains, paper_gains
 from companion.core.monitor import prediction_error_bound_m
 from companion.core.neighbours import PeerLimits
-from companion.core.plan import GotoLeg, Leg, Motion, SlotChange, TurnLeg, VelocityLeg, goto_duration_s
+from companion.core.plan import (
+    GotoLeg,
+    Leg,
+    Motion,
+    SlotChange,
+    TurnLeg,
+    VelocityLeg,
+    goto_duration_s,
+    with_formation,
+    with_legs,
+)
+from companion.core.route import first_breach
 from companion.core.safety import DOWNWASH_RATIO, SafetyLimits, safety_radius_m
 from companion.core.trigger import RAISED_MAX_M, ErrorTrigger, Spacing, SwitchingTrigger, TriggerKind
 from companion.core.values import ZERO
@@ -178,6 +190,24 @@ class LimitsTable(_Table):
     gust_m_s2: NotNegative = 0.3
 
 
+class FenceTable(_Table):
+    """Where the vehicles may be: a cylinder or a polygon over the ground, floor and ceiling. No table, no fence."""
+
+    radius_m: Positive | None = None
+    """of the cylinder; None with a polygon, or where floor and ceiling alone limit"""
+    centre_m: tuple[Real, Real] | None = None
+    """north, east of the fleet origin; None: the origin"""
+    polygon_m: tuple[tuple[Real, Real], ...] | None = None
+    """corners (north, east), at least three, either way round"""
+    floor_m: Annotated[float, Field(ge=-500, le=1000, allow_inf_nan=False)]
+    """above the fleet origin"""
+    ceiling_m: Annotated[float, Field(ge=-500, le=1000, allow_inf_nan=False)]
+    margin_m: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)] = 2.0
+    """vehicles and plans stay this far inside the edge: lag and gusts are paid from it"""
+    vertical_margin_m: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)] = 0.5
+    """and this far from floor and ceiling"""
+
+
 class PeersTable(_Table):
     """Exchange between the vehicles."""
 
@@ -278,6 +308,7 @@ class FleetConfig(_Table):
     law: LawTable = LawTable()
     trigger: TriggerTable = TriggerTable()
     limits: LimitsTable = LimitsTable()
+    fence: FenceTable | None = None
     peers: PeersTable = PeersTable()
     preflight: PreflightTable = PreflightTable()
     launch: LaunchTable = LaunchTable()
@@ -394,8 +425,19 @@ class FleetConfig(_Table):
         x = self.limits
         return SafetyLimits(
             x.speed_max_m_s, x.climb_max_m_s, x.descent_max_m_s, x.jerk_max_m_s3,
-            x.avoidance_acceleration_m_s2, x.barrier,
+            x.avoidance_acceleration_m_s2, x.barrier, self.geofence,
         )  # fmt: skip
+
+    @cached_property
+    def geofence(self) -> Fence | None:
+        """The fence as the companion flies it; None if there is none."""
+        x = self.fence
+        if x is None:
+            return None
+        north, east = (0.0, 0.0) if x.centre_m is None else x.centre_m
+        return Fence(
+            x.floor_m, x.ceiling_m, x.radius_m, north, east, x.polygon_m or (), x.margin_m, x.vertical_margin_m
+        )
 
     def slots(self, shape: str) -> Slots:
         """Slots (forward, right, down) of a shape for the enabled vehicles; refused if they are too close."""
@@ -563,6 +605,8 @@ def parse(tables: Mapping[str, Any], name: str) -> FleetConfig:
             config.slots(config.formation.shape)
         except ConfigError as error:
             faults.append(str(error))
+        else:
+            faults += _outside_faults(config)
     if faults:
         raise ConfigError("\n".join(f"{name}: {fault}" for fault in faults))
     return config
@@ -610,6 +654,8 @@ def _faults(config: FleetConfig) -> Iterator[str]:
             f"got {config.trigger.t_min_s:g}"
         )
     yield from _plan_faults(config)
+    if config.fence is not None:
+        yield from _fence_faults(config.fence)
 
 
 def _plan_faults(config: FleetConfig) -> Iterator[str]:
@@ -645,6 +691,77 @@ def _plan_faults(config: FleetConfig) -> Iterator[str]:
                         f"got {leg.speed_m_s:g}"
                     )
                 altitude_m = altitude_m if leg.altitude_m is None else leg.altitude_m
+
+
+def _fence_faults(fence: FenceTable) -> Iterator[str]:
+    """A fence that is none: two kinds of edge at once, an edge that crosses itself, nothing left inside."""
+    if fence.radius_m is not None and fence.polygon_m is not None:
+        yield "$.fence must have radius_m or polygon_m, got both"
+    if fence.radius_m is None and fence.centre_m is not None:
+        yield "$.fence.centre_m belongs to radius_m, which is missing"
+    lowest, highest = fence.floor_m + fence.vertical_margin_m, fence.ceiling_m - fence.vertical_margin_m
+    if lowest > highest:
+        yield (
+            f"$.fence.ceiling_m must be at least {2 * fence.vertical_margin_m:g} m (twice $.fence.vertical_margin_m) "
+            f"above $.fence.floor_m = {fence.floor_m:g} m, got {fence.ceiling_m:g}"
+        )
+    if fence.radius_m is not None and fence.radius_m <= fence.margin_m:
+        yield f"$.fence.radius_m must be > $.fence.margin_m = {fence.margin_m:g} m, got {fence.radius_m:g}"
+    if fence.polygon_m is None:
+        return
+    if len(fence.polygon_m) < 3:
+        yield f"$.fence.polygon_m must have at least 3 corners, got {len(fence.polygon_m)}"
+        return
+    # Only here: a companion without a polygon need not load it.
+    from shapely import Polygon
+    from shapely.validation import explain_validity
+
+    polygon = Polygon(fence.polygon_m)
+    if not polygon.is_valid:
+        yield f"$.fence.polygon_m must not cross or touch itself, got {explain_validity(polygon)}"
+    elif polygon.buffer(-fence.margin_m).is_empty:
+        yield f"$.fence.polygon_m must be wider than twice $.fence.margin_m = {fence.margin_m:g} m, got nothing inside"
+
+
+def _outside_faults(config: FleetConfig) -> Iterator[str]:
+    """Pads, formation and plan that are not inside the fence."""
+    fence = config.geofence
+    if fence is None:
+        return
+    for v in config.vehicles:
+        room = fence.edge_room_m(v.pad_north_m, v.pad_east_m)
+        if room < 0.0:
+            yield (
+                f"$.vehicle[{v.instance}].pad_m must be inside the fence by $.fence.margin_m = {fence.margin_m:g} m, "
+                f"got [{v.pad_north_m:g}, {v.pad_east_m:g}], {-room:.2f} m too far out"
+            )
+    if fence.vertical_room_m(-config.formation.altitude_m) < 0.0:
+        yield (
+            f"$.formation.altitude_m must be >= {-fence.lowest_down_m:g} and <= {-fence.highest_down_m:g} m "
+            f"(between floor and ceiling of the fence, less $.fence.vertical_margin_m), "
+            f"got {config.formation.altitude_m:g}"
+        )
+        return
+    formed = with_formation(
+        config.first_motion, at_ns=0, issuer=0, shape=config.formation.shape,
+        slots=config.slots(config.formation.shape), pinned=config.pinned,
+        speed_m_s=config.limits.speed_max_m_s / 2,
+    )  # fmt: skip
+    breach = first_breach(formed, fence)
+    if breach is not None:
+        yield (
+            f"$.formation: the slot of vehicle {breach.vehicle_id} must be inside the fence by its margin, "
+            f"got {breach.outside_m:.2f} m beyond it"
+        )
+        return
+    start_ns = formed.blend_end_ns
+    legs = config.plan_legs(formed.moment(start_ns).centre.position)
+    breach = first_breach(with_legs(formed, at_ns=start_ns, issuer=0, legs=legs, then=config.plan.then), fence)
+    if breach is not None:
+        yield (
+            f"$.plan.legs[{breach.leg}] must stay inside the fence by its margin, "
+            f"got vehicle {breach.vehicle_id} {breach.outside_m:.2f} m beyond it {breach.time_s:.1f} s into the plan"
+        )
 
 
 _UNITS = {

@@ -10,6 +10,7 @@ from companion.core.frames import Ned
 from companion.core.hold import HoldKind, axis, weights
 from companion.core.plan import Moment, Programme, Reference
 from companion.core.values import FILTERED_PHASES, ZERO, Instant, Neighbour, PeerMessage, PeerSample, Phase
+from companion.core.vectors import between, share_of_segment
 
 FUTURE_LIMIT_S = 1.0
 """a sample from further ahead than this comes from a clock that is wrong"""
@@ -228,8 +229,11 @@ class PeerTable:
         return [n._replace(in_formation=False) if n.vehicle_id in self._gated else n for n in neighbours]
 
     def _in_range(self, n: Neighbour, ego_ned_m: Ned) -> bool:
-        limit, other = self.limits.range_m, n.other_end_ned_m
-        return dist(n.position_ned_m, ego_ned_m) <= limit or (other is not None and dist(other, ego_ned_m) <= limit)
+        """Whether it may be within range: for a lost peer, the nearest place between its two ends."""
+        place, other = n.position_ned_m, n.other_end_ned_m
+        if other is not None:
+            place = between(place, other, share_of_segment(ego_ned_m, place, other))
+        return dist(place, ego_ned_m) <= self.limits.range_m
 
     def _predict(self, peer: _Peer, sample: PeerSample, now: Instant, reference: Reference, own: Ned) -> Neighbour:
         limits = self.limits

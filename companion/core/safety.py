@@ -1,6 +1,8 @@
 """The safety filter: the last thing between a command and the autopilot. It knows nothing of the law.
 
-Priority, highest first: finite, distance to peers, acceleration, speed, jerk. Nothing below delays what stands above.
+Priority, highest first: finite, distance to peers, fence, acceleration, speed, jerk. Nothing below delays what stands
+above: where peers and fence cannot both be kept, the peers are, and of the commands that do so the one that misses the
+fence least is flown.
 
 Distance is kept by an exponential control barrier per pair. With x = p_i - p^_j, vertical lengths divided by
 c = 2.5 (a multirotor's downwash), d the safety radius of the pair and both poles at 2.5 /s,
@@ -12,6 +14,9 @@ pair whose filters are both active each takes half; toward anybody else this veh
 the law's that satisfies every half-plane is a quadratic program in two unknowns; it is solved exactly, one plane after
 another, in at most n (n - 1)/2 steps. (Cyclic projections, 40 sweeps, missed a point that exists in 3 of 100 random
 sets of up to nine planes, and took five times as long at their worst.)
+
+The fence's walls are half-planes of the same kind (`core.fence`). Altitude is limited where it is flown: the position
+sent stays between floor and ceiling, and the velocity sent ends there.
 """
 
 from collections import Counter
@@ -21,8 +26,10 @@ from math import copysign, hypot, inf, isfinite, sqrt
 from typing import NamedTuple
 
 from companion.core.estimate import VelocityReference
+from companion.core.fence import Fence, braking_pole_per_s, wall_plane
 from companion.core.frames import Ned
 from companion.core.values import Command, Neighbour, SafeSetpoint, VehicleState
+from companion.core.vectors import between, share_of_segment
 
 DOWNWASH_RATIO = 2.5
 """vertical half-axis of the safety ellipsoid over its horizontal one"""
@@ -36,6 +43,17 @@ SPEED_APPROACH_PER_S = 2.0
 SIDESTEP_SPEED_M_S = 0.6
 """speed along the obstacle at which a blocked vehicle passes it, on its right"""
 TOLERANCE_M2_S2 = 1e-3
+FENCE_ID = 0
+"""stands for the fence where a half-plane names a vehicle"""
+BIAS_MAX_M_S = 1.0
+"""most of the estimator's velocity bias, per axis, that is put back into what is sent: PX4's is 0.15-0.25 m/s. It is
+added after the speed limit, so that no more than speed_max + 1.42 m/s is ever sent"""
+ALTITUDE_APPROACH_PER_S = 1.0
+"""how fast the vertical velocity sent may lead to floor or ceiling: per metre that is left"""
+FENCE_MISS_M_S2 = 0.01
+"""from this on a fence that is not kept is counted"""
+FAR_M = 1e6
+"""a peer said to be farther than this is looked at in full, since its numbers may not be finite ones"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +68,9 @@ class SafetyLimits:
     avoidance_acceleration_m_s2: float
     """horizontal; what avoidance may use, beyond the law's own limit"""
     barrier: bool = True
+    """keep the distance to peers"""
+    fence: Fence | None = None
+    """kept whether or not the distance to peers is"""
 
 
 class HalfPlane(NamedTuple):
@@ -66,16 +87,6 @@ def safety_radius_m(neighbour_uncertainty_m: float) -> float:
     return COLLISION_DISTANCE_M + LAG_ALLOWANCE_M + neighbour_uncertainty_m
 
 
-def _share_of_segment(position: Ned, a: Ned, b: Ned) -> float:
-    """How far along from a (0) to b (1) the place nearest to us is, by the ellipsoid's measure of distance."""
-    north, east, down = b.north - a.north, b.east - a.east, (b.down - a.down) / DOWNWASH_RATIO**2
-    length2 = north * north + east * east + down * (b.down - a.down)
-    if length2 <= 1e-9:
-        return 0.0
-    along = (position.north - a.north) * north + (position.east - a.east) * east + (position.down - a.down) * down
-    return min(max(along / length2, 0.0), 1.0)
-
-
 def nearest_hypothesis(position: Ned, neighbour: Neighbour) -> tuple[Ned, Ned]:
     """Where on the line between a lost peer's two possible ends it is nearest to us, and how fast that point moves.
 
@@ -84,16 +95,9 @@ def nearest_hypothesis(position: Ned, neighbour: Neighbour) -> tuple[Ned, Ned]:
     a, v, b = neighbour.position_ned_m, neighbour.velocity_ned_m_s, neighbour.other_end_ned_m
     if b is None:
         return a, v
-    share = _share_of_segment(position, a, b)
+    share = share_of_segment(position, a, b, DOWNWASH_RATIO)
     moving = 1.0 - share
-    return (
-        Ned(
-            a.north + share * (b.north - a.north),
-            a.east + share * (b.east - a.east),
-            a.down + share * (b.down - a.down),
-        ),
-        Ned(moving * v.north, moving * v.east, moving * v.down),
-    )
+    return between(a, b, share), Ned(moving * v.north, moving * v.east, moving * v.down)
 
 
 def half_plane(ego: VehicleState, shared_acceleration: Ned, neighbour: Neighbour) -> HalfPlane:
@@ -129,7 +133,7 @@ def _across_segment(position: Ned, neighbour: Neighbour, vx: float, vy: float, v
     motion past a point it would seem to carry us away, and the filter would let us in.
     """
     a, b = neighbour.position_ned_m, neighbour.other_end_ned_m
-    if b is None or not 0.0 < _share_of_segment(position, a, b) < 1.0:
+    if b is None or not 0.0 < share_of_segment(position, a, b, DOWNWASH_RATIO) < 1.0:
         return vx, vy, vz
     x, y, z = b.north - a.north, b.east - a.east, (b.down - a.down) / DOWNWASH_RATIO
     along = (vx * x + vy * y + vz * z) / (x * x + y * y + z * z)
@@ -150,6 +154,31 @@ def barrier(
     g_north, g_east = 2.0 * x, 2.0 * y
     half = -0.5 * drift + g_north * shared_north + g_east * shared_east
     return g_north, g_east, half if shared else -drift
+
+
+def out_of_reach(ego: VehicleState, shared_acceleration: Ned, neighbour: Neighbour, most_m_s2: float) -> bool:
+    """Whether every command up to `most_m_s2` satisfies the pair's half-plane, told from the distance alone.
+
+    With r the distance (vertical lengths divided by c), w the relative speed, p the pole, d the safety radius, U the
+    largest command and S that of both slots' plan: |g| <= 2 r and h' >= -2 r w, so that
+
+        p^2 (r^2 - d^2) - 4 p r w - k r >= 0,   k = 2 U, or 4 (U + S) where each of a pair takes half
+
+    is enough for g.u >= b. It holds for all r >= d + (4 p w + k)/p^2. A lost peer's line is always looked at in full.
+    """
+    if neighbour.other_end_ned_m is not None:
+        return False
+    p, q = neighbour.position_ned_m, ego.position_ned_m
+    v, w = neighbour.velocity_ned_m_s, ego.velocity_ned_m_s
+    x, y, z = q.north - p.north, q.east - p.east, (q.down - p.down) / DOWNWASH_RATIO
+    vx, vy, vz = w.north - v.north, w.east - v.east, (w.down - v.down) / DOWNWASH_RATIO
+    k = 2.0 * most_m_s2
+    if neighbour.shares_avoidance:
+        s, t = shared_acceleration, neighbour.reference_acceleration_ned_m_s2
+        k = 4.0 * (most_m_s2 + 0.5 * hypot(s.north + t.north, s.east + t.east))
+    speed = sqrt(vx * vx + vy * vy + vz * vz)
+    reach = safety_radius_m(neighbour.uncertainty_m) + (4.0 * POLE_PER_S * speed + k) / POLE_PER_S**2
+    return reach * reach <= x * x + y * y + z * z < FAR_M * FAR_M
 
 
 def nearest_feasible(u_north: float, u_east: float, planes: Sequence[HalfPlane]) -> tuple[float, float, bool]:
@@ -239,9 +268,11 @@ class SafetyFilter:
         planes: list[HalfPlane] = []
         unknown = 0
         if self.limits.barrier:
-            planes = [half_plane(ego, command.reference_acceleration_ned_m_s2, n) for n in neighbours]
+            shared, most = command.reference_acceleration_ned_m_s2, self.limits.avoidance_acceleration_m_s2
+            planes = [half_plane(ego, shared, n) for n in neighbours if not out_of_reach(ego, shared, n, most)]
             known = [p for p in planes if isfinite(p.g_north + p.g_east + p.b)]
             unknown, planes = len(planes) - len(known), known
+        walls = self._walls(ego)
         if unknown:
             self._acted.add("peer not finite: braking")
             u = self._clipped(-v_north, -v_east)
@@ -250,16 +281,17 @@ class SafetyFilter:
         else:
             self._acted.add("command not finite: braking")
             u = self._clipped(-v_north, -v_east)
-        u = self._apart(u, planes, ego, neighbours)
+        u = self._kept(u, planes, walls, ego, neighbours)
         self.acceleration_m_s2 = u
         north, east = self.velocity_reference.step(u[0], u[1], v_north, v_east, dt_s)
         speed = hypot(north, east)
         if speed > self.limits.speed_max_m_s:
             self._acted.add("speed")
             north, east = (x * self.limits.speed_max_m_s / speed for x in (north, east))
-        bias = velocity_bias_ned_m_s
+        bias = self._bounded(velocity_bias_ned_m_s)
         north, east = north + bias.north, east + bias.east
-        down = command.reference_velocity_ned_m_s.down + bias.down
+        position_down, velocity_down = self._vertical(command, ego)
+        velocity_down += bias.down
         self.counts.update(self._acted)
         if not isfinite(u[0] + u[1] + north + east):
             # Finite inputs so large that their products are not.
@@ -269,10 +301,10 @@ class SafetyFilter:
         return SafeSetpoint(
             velocity_north_m_s=north,
             velocity_east_m_s=east,
-            velocity_down_m_s=min(max(down, -self.limits.climb_max_m_s), self.limits.descent_max_m_s),
+            velocity_down_m_s=min(max(velocity_down, -self.limits.climb_max_m_s), self.limits.descent_max_m_s),
             acceleration_north_m_s2=u[0],
             acceleration_east_m_s2=u[1],
-            position_down_m=command.reference_position_ned_m.down,
+            position_down_m=position_down,
             yaw_rad=command.yaw_rad,
         )
 
@@ -305,28 +337,83 @@ class SafetyFilter:
         self._acted.add("acceleration")
         return u_north * most / size, u_east * most / size
 
-    def _apart(
-        self, u: tuple[float, float], planes: Sequence[HalfPlane], ego: VehicleState, neighbours: Sequence[Neighbour]
+    def _bounded(self, bias: Ned) -> Ned:
+        if max(abs(bias.north), abs(bias.east), abs(bias.down)) <= BIAS_MAX_M_S:
+            return bias
+        self._acted.add("velocity bias")
+        return Ned(*(min(max(x, -BIAS_MAX_M_S), BIAS_MAX_M_S) for x in bias))
+
+    def _vertical(self, command: Command, ego: VehicleState) -> tuple[float, float]:
+        """Down (m) and downward velocity (m/s) to send, within floor and ceiling and not leading beyond them."""
+        down, v = command.reference_position_ned_m.down, command.reference_velocity_ned_m_s.down
+        fence = self.limits.fence
+        if fence is None:
+            return down, v
+        held = min(max(down, fence.highest_down_m), fence.lowest_down_m)
+        up = ALTITUDE_APPROACH_PER_S * max(min(held, ego.position_ned_m.down) - fence.highest_down_m, 0.0)
+        below = ALTITUDE_APPROACH_PER_S * max(fence.lowest_down_m - max(held, ego.position_ned_m.down), 0.0)
+        kept = min(max(v, -up), below)
+        if held != down or kept != v:
+            self._acted.add("altitude")
+        return held, kept
+
+    def _walls(self, ego: VehicleState) -> list[HalfPlane]:
+        """The fence's half-planes that some admissible command breaks."""
+        limits = self.limits
+        if limits.fence is None:
+            return []
+        (north, east, _), (v_north, v_east, _) = ego.position_ned_m, ego.velocity_ned_m_s
+        if not limits.fence.contains(ego.position_ned_m):
+            self._acted.add("outside the fence")
+        pole = braking_pole_per_s(limits.speed_max_m_s, limits.avoidance_acceleration_m_s2)
+        planes = [
+            HalfPlane(*wall_plane(wall, v_north, v_east, pole), FENCE_ID) for wall in limits.fence.walls(north, east)
+        ]
+        return [p for p in planes if p.b > -limits.avoidance_acceleration_m_s2]
+
+    def _kept(
+        self,
+        u: tuple[float, float],
+        peers: Sequence[HalfPlane],
+        walls: Sequence[HalfPlane],
+        ego: VehicleState,
+        neighbours: Sequence[Neighbour],
     ) -> tuple[float, float]:
-        """The command that keeps all distances, nearest to u, within the acceleration that avoidance may use."""
-        blocking = [p for p in planes if _deficit_m_s2(p, u) > 0.0]
-        if not blocking:
+        """The command that keeps distances and fence, nearest to u, within the acceleration that avoidance may use."""
+        blocking = [p for p in peers if _deficit_m_s2(p, u) > 0.0]
+        at_fence = any(_deficit_m_s2(w, u) > 0.0 for w in walls)
+        if not blocking and not at_fence:
             return u
-        self._acted.add("peer distance")
+        if at_fence:
+            self._acted.add("fence")
         most = self.limits.avoidance_acceleration_m_s2
         # No admissible command comes near the others' edges.
-        planes = [p for p in planes if p.b > -most * hypot(p.g_north, p.g_east)]
-        u = _sidestep(u, max(blocking, key=lambda p: _deficit_m_s2(p, u)), ego, neighbours)
+        peers = [p for p in peers if p.b > -most * hypot(p.g_north, p.g_east)]
+        if blocking:
+            self._acted.add("peer distance")
+            u = _sidestep(u, max(blocking, key=lambda p: _deficit_m_s2(p, u)), ego, neighbours)
+        planes = [*peers, *walls]
         north, east, met = nearest_feasible(u[0], u[1], planes)
         if met and hypot(north, east) <= most:
             return north, east
         gentlest = nearest_feasible(0.0, 0.0, planes)
         if gentlest[2] and hypot(gentlest[0], gentlest[1]) <= most:
-            # Between two commands that keep the distances all do.
+            # What lies between two commands that keep everything keeps it too.
             self._acted.add("acceleration")
             return _within(gentlest[0], gentlest[1], north, east, most)
-        self._acted.add("peer distance not attainable")
-        return _least_missing(planes, most)
+        north, east, met = nearest_feasible(0.0, 0.0, peers)
+        kept = peers
+        if not met or hypot(north, east) > most:
+            self._acted.add("peer distance not attainable")
+            north, east = _least_missing(peers, most)
+            miss = max(p.b - p.g_north * north - p.g_east * east for p in peers)
+            kept = [p._replace(b=p.b - max(miss, 0.0)) for p in peers]
+        if not walls:
+            return north, east
+        north, east = _least_missing(walls, most, kept, (north, east))
+        if any(_deficit_m_s2(w, (north, east)) > FENCE_MISS_M_S2 for w in walls):
+            self._acted.add("fence not attainable")
+        return north, east
 
 
 def _deficit_m_s2(plane: HalfPlane, u: tuple[float, float]) -> float:
@@ -345,14 +432,23 @@ def _within(a_north: float, a_east: float, b_north: float, b_east: float, most: 
     return a_north + share * d_north, a_east + share * d_east
 
 
-def _least_missing(planes: Sequence[HalfPlane], most: float) -> tuple[float, float]:
-    """The command with norm up to `most` (m/s^2) that misses the half-planes least, by the largest miss of h'' + ..."""
-    u = (0.0, 0.0)
-    weights = [0.0] * len(planes)
-    low, high = 0.0, max(p.b for p in planes)
-    for _ in range(RELAXATIONS):
+def _least_missing(
+    planes: Sequence[HalfPlane],
+    most: float,
+    kept: Sequence[HalfPlane] = (),
+    start: tuple[float, float] = (0.0, 0.0),
+) -> tuple[float, float]:
+    """The command with norm up to `most` (m/s^2) that misses the half-planes least, by the largest miss of h'' + ...
+
+    It stays within the half-planes `kept`, as the command `start` does.
+    """
+    u = start
+    weights = [0.0] * (len(kept) + len(planes))
+    low, high = 0.0, max(p.b - p.g_north * u[0] - p.g_east * u[1] for p in planes)
+    for _ in range(RELAXATIONS if high > 0.0 else 0):
         relaxed = 0.5 * (low + high)
-        north, east, met = project(0.0, 0.0, [(g_n, g_e, b - relaxed) for g_n, g_e, b, _ in planes], weights)
+        rows = [*kept, *(p._replace(b=p.b - relaxed) for p in planes)]
+        north, east, met = project(0.0, 0.0, rows, weights)
         if met and hypot(north, east) <= most:
             u, high = (north, east), relaxed
         else:

@@ -193,7 +193,7 @@ def test_a_value_out_of_its_range_is_refused_with_place_value_and_range(path: st
 @pytest.mark.parametrize(
     ("path", "known"),
     [
-        ("colour", "fleet, formation, launch"),
+        ("colour", "fence, fleet, formation, launch"),
         ("fleet.colour", "frame, name, origin"),
         ("fleet.origin.colour", "altitude_amsl_m, latitude_deg, longitude_deg"),
         ("law.colour", "a_max_m_s2"),
