@@ -27,7 +27,7 @@ Floats = npt.NDArray[np.float64]
 Record = dict[str, Any]
 """values that JSON can hold"""
 
-STUDIES = ("example1", "example2", "table3", "readings", "pareto", "faults", "scale", "theory")
+STUDIES = ("example1", "example2", "table3", "readings", "pareto", "faults", "headon", "scale", "theory")
 
 # Payloads as `companion.wire.peer` lays them out (bytes); the published intent carries c, g, w, e, e' instead of p, v.
 MESSAGE_BYTES = 57
@@ -173,7 +173,8 @@ def fingerprint(config: Config) -> str:
     digest = blake2s(digest_size=8)
     digest.update(config.text.encode())
     digest.update(swarm.kernels().source_hash().encode())
-    for path in (study_module(config.name).__file__, swarm.__file__):
+    module = study_module(config.name)
+    for path in (module.__file__, swarm.__file__, *getattr(module, "SOURCES", ())):
         digest.update(Path(str(path)).read_bytes())
     return digest.hexdigest()
 

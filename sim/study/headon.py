@@ -1,0 +1,254 @@
+"""Head-on by a broken law: what distance the safety filter keeps over lag, delay and loss, and where safety ends.
+
+The vehicles are the real thing: two agents with their event-triggered messages, on stub autopilots in lockstep. Only
+what the law says is replaced, just before the filter, by a command that flies at the other vehicle.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from itertools import product
+from math import dist, hypot
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import numpy as np
+
+from companion.config import FleetConfig, parse
+from companion.core.frames import Ned
+from companion.core.safety import SafetyFilter
+from companion.core.values import Command, Neighbour, Phase, SafeSetpoint, VehicleState
+from companion.errors import ConfigError
+from sim.lockstep import Lockstep
+from sim.network import NetworkParameters
+from sim.study.common import Column, Config, Figure, Outcome, Record, Table, proportion_text
+from sim.study.figures import BLUE, GREEN, GREY, RED, panels
+
+TITLE = "Head-on by a broken law: lag, delay and loss"
+SOURCES = tuple(
+    sorted(p for folder in ("companion", "sim") for p in (Path(__file__).parents[2] / folder).rglob("*.py"))
+)
+"""everything that flies here: finished seeds are run anew when any of it changes"""
+COLLISION_M = 0.5
+BAR_M = 0.85
+READY_S = 30.0
+MEETING_S = 16.0
+GAIN_PER_S = 3.0
+PUSH_MAX_M_S2 = 5.0
+SCATTER_M = 0.05
+"""how far the two pads' lines lie apart at most"""
+
+
+@dataclass(frozen=True, slots=True)
+class Meeting:
+    """What is the same in every meeting."""
+
+    speed_m_s: float
+    apart_m: float
+    altitude_m: float
+    lags_s: tuple[float, ...]
+    delays_s: tuple[float, ...]
+    losses: tuple[float, ...]
+    noise_m: float
+    gust_m_s2: float
+
+
+@dataclass(slots=True)
+class BrokenLaw(SafetyFilter):
+    """The filter of a vehicle whose law flies at the other one, whatever the plan and its peers say."""
+
+    velocity_ned_m_s: Ned | None = None
+    """None: the law is sound"""
+
+    def apply(
+        self,
+        command: Command,
+        ego: VehicleState,
+        neighbours: Sequence[Neighbour],
+        velocity_bias_ned_m_s: Ned,
+        dt_s: float,
+    ) -> SafeSetpoint | None:
+        """Filter the broken law's command instead of the given one."""
+        if self.velocity_ned_m_s is not None:
+            wanted, v = self.velocity_ned_m_s, ego.velocity_ned_m_s
+            north, east = GAIN_PER_S * (wanted.north - v.north), GAIN_PER_S * (wanted.east - v.east)
+            over = max(hypot(north, east) / PUSH_MAX_M_S2, 1.0)
+            command = command._replace(acceleration_ned_m_s2=Ned(north / over, east / over, 0.0))
+        return SafetyFilter.apply(self, command, ego, neighbours, velocity_bias_ned_m_s, dt_s)
+
+
+def _meeting(config: Config) -> Meeting:
+    given = dict(config.values.get("meeting", {}))
+    known = {f.name for f in fields(Meeting)}
+    if set(given) != known:
+        wrong = ", ".join(sorted(set(given) ^ known))
+        raise ConfigError(f"headon.toml: $.meeting must have the keys {', '.join(sorted(known))}; wrong: {wrong}")
+    values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in given.items()}
+    return Meeting(**values)
+
+
+def _fleet(meeting: Meeting, lag_s: float, barrier: bool, aside_m: float) -> FleetConfig:
+    half = 0.5 * meeting.apart_m
+    return parse(
+        {
+            "fleet": {"name": "headon", "frame": "local"},
+            "formation": {"altitude_m": meeting.altitude_m},
+            "plan": {"automatic": False},
+            "limits": {
+                "barrier": barrier, "position_noise_m": meeting.noise_m, "velocity_noise_m_s": meeting.noise_m,
+                "gust_m_s2": meeting.gust_m_s2,
+            },
+            "stub": {
+                "lag_s": lag_s, "position_noise_m": meeting.noise_m, "velocity_noise_m_s": meeting.noise_m,
+                "gust_m_s2": meeting.gust_m_s2, "origin_scatter_m": 0.0,
+            },
+            "vehicle": [{"id": 1, "pad_m": [-half, 0.0]}, {"id": 2, "pad_m": [half, aside_m]}],
+        },
+        "headon.toml",
+    )  # fmt: skip
+
+
+def meet(meeting: Meeting, seed: int, *, lag_s: float, delay_s: float, loss: float, barrier: bool = True) -> Record:
+    """Fly one meeting; the smallest true distance of the two (m), and what it took."""
+    config = _fleet(meeting, lag_s, barrier, Random(f"headon/{seed}").uniform(-SCATTER_M, SCATTER_M))
+    fleet = Lockstep(config, seed=seed, network=NetworkParameters(delay_s=delay_s, loss=loss))
+    laws = {}
+    for i, v in fleet.vehicles.items():
+        v.agent.safety = laws[i] = BrokenLaw(config.safety_limits)
+    fleet.run_until(READY_S, lambda: not any(v.agent.unready(fleet.now) for v in fleet.vehicles.values()))
+    fleet.command(b'{"verb":"takeoff"}')
+    fleet.run_until(fleet.now_ns * 1e-9 + READY_S, lambda: fleet.all_in(Phase.FORMING))
+    if not fleet.all_in(Phase.FORMING):
+        raise ConfigError(f"head-on: the two are not in the air after {READY_S:g} s: {fleet.notes}")
+    start_ns, sent = fleet.now_ns, len(fleet.sent)
+    for i, way in ((1, 1.0), (2, -1.0)):
+        laws[i].velocity_ned_m_s = Ned(way * meeting.speed_m_s, 0.0, 0.0)
+
+    def passed() -> bool:
+        p = fleet.positions()
+        return p[1].north > p[2].north and dist(p[1], p[2]) > 0.25 * meeting.apart_m
+
+    fleet.run_until(start_ns * 1e-9 + MEETING_S, passed)
+    rows = fleet.truth().reshape(-1, 2)
+    met = rows["position_ned_m"][rows["time_unix_ns"][:, 0] >= fleet.now.fleet_ns - (fleet.now_ns - start_ns)]
+    return {
+        "minimum_distance_m": float(np.linalg.norm(met[:, 0] - met[:, 1], axis=1).min()),
+        "passed": passed(),
+        "messages": len(fleet.sent) - sent,
+        "not_attainable": sum(law.counts["peer distance not attainable"] for law in laws.values()),
+    }
+
+
+def _cells(meeting: Meeting) -> list[tuple[float, float, float]]:
+    return list(product(meeting.lags_s, meeting.losses, meeting.delays_s))
+
+
+def piece(config: Config, seed: int) -> Record:
+    """Every meeting under one seed."""
+    meeting = _meeting(config)
+    return {
+        "cells": [meet(meeting, seed, lag_s=g, delay_s=d, loss=x) for g, x, d in _cells(meeting)],
+        "compared": [meet(meeting, seed, **given) for given in config.values.get("compared", [])],
+    }
+
+
+def _row(records: Sequence[Record]) -> Record:
+    distances = [r["minimum_distance_m"] for r in records]
+    return {
+        "median_m": float(np.median(distances)),
+        "least_m": min(distances),
+        "close": proportion_text(sum(d < COLLISION_M for d in distances), len(distances)),
+        "close_count": sum(d < COLLISION_M for d in distances),
+        "passed": sum(r["passed"] for r in records) / len(records),
+        "messages": float(np.mean([r["messages"] for r in records])),
+    }
+
+
+def finish(config: Config, pieces: Sequence[Record], seeds: Sequence[int]) -> Outcome:
+    """The table, the edge of the safe region, and the distance over the delay."""
+    meeting = _meeting(config)
+    outcome = Outcome()
+    rows: list[Record] = []
+    for k, (lag, loss, delay) in enumerate(_cells(meeting)):
+        rows.append({"lag_s": lag, "loss_percent": 100 * loss, "delay_ms": 1000 * delay})
+        rows[-1] |= _row([p["cells"][k] for p in pieces])
+    shown = (
+        Column("median_m", "minimum distance, median (m)", 2), Column("least_m", "least of all seeds (m)", 2),
+        Column("close", f"seeds below {COLLISION_M} m"), Column("messages", "messages of both", 0),
+    )  # fmt: skip
+    inputs = (
+        Column("lag_s", "lag (s)", 2),
+        Column("loss_percent", "loss (%)", 0),
+        Column("delay_ms", "delay (ms)", 0),
+    )
+    outcome.tables.append(
+        Table(
+            "headon_table", f"Head-on at {meeting.speed_m_s:g} m/s each, event-triggered", (*inputs, *shown), rows,
+            "Real agents on stub autopilots in lockstep, noise and gusts as in the set-up; only the law is broken.",
+        )
+    )  # fmt: skip
+    edges = [_edge(rows, lag, loss) for lag, loss in product(meeting.lags_s, meeting.losses)]
+    outcome.tables.append(
+        Table(
+            "headon_edge", "The edge of the safe region", (
+                *inputs[:2],
+                Column("safe_ms", f"longest delay with every seed above {COLLISION_M} m (ms)", 0),
+                Column("bar_ms", f"above {BAR_M} m (ms)", 0),
+            ),
+            edges, f"Of {', '.join(f'{1000 * d:g}' for d in meeting.delays_s)} ms; – where not even the shortest is.",
+        )
+    )  # fmt: skip
+    compared: list[Record] = [
+        {"case": "with the filter" if given["barrier"] else "without", **_row([p["compared"][k] for p in pieces])}
+        for k, given in enumerate(config.values.get("compared", []))
+    ]
+    columns = (Column("case", "case"), *shown)
+    outcome.tables.append(Table("headon_compared", "The same flight without the filter's distance", columns, compared))
+    outcome.values |= {"rows": rows, "edges": edges, "compared": compared}
+    outcome.findings.append(_finding(rows, len(seeds)))
+    outcome.figures.append(_figure(meeting, rows))
+    return outcome
+
+
+def _edge(rows: Sequence[Record], lag: float, loss: float) -> Record:
+    """The longest delay up to which all shorter ones keep every seed above a distance."""
+    mine = sorted(
+        (r for r in rows if r["lag_s"] == lag and r["loss_percent"] == 100 * loss), key=lambda r: r["delay_ms"]
+    )
+
+    def longest(distance_m: float) -> float | None:
+        held: float | None = None
+        for r in mine:
+            if r["least_m"] < distance_m:
+                break
+            held = r["delay_ms"]
+        return held
+
+    return {"lag_s": lag, "loss_percent": 100 * loss, "safe_ms": longest(COLLISION_M), "bar_ms": longest(BAR_M)}
+
+
+def _finding(rows: Sequence[Record], seeds: int) -> str:
+    close = sum(r["close_count"] for r in rows)
+    worst = min(rows, key=lambda r: r["least_m"])
+    return (
+        f"{close} of {len(rows) * seeds} meetings come below {COLLISION_M} m; the least distance is "
+        f"{worst['least_m']:.2f} m, at {worst['lag_s']:g} s of lag, {worst['delay_ms']:g} ms and "
+        f"{worst['loss_percent']:g} % loss."
+    )
+
+
+def _figure(meeting: Meeting, rows: Sequence[Record]) -> Figure:
+    fig, axes = panels(1, len(meeting.lags_s), 7.4, 3.0, sharey=True)
+    colours: list[Any] = [BLUE, GREEN, GREY]
+    for ax, lag in zip(axes[0], meeting.lags_s, strict=True):
+        for k, loss in enumerate(meeting.losses):
+            mine = [r for r in rows if r["lag_s"] == lag and r["loss_percent"] == 100 * loss]
+            ax.plot(
+                [r["delay_ms"] for r in mine], [r["least_m"] for r in mine], "o-", ms=4, lw=1,
+                color=colours[k % len(colours)], label=f"{100 * loss:g} % loss",
+            )  # fmt: skip
+        ax.axhline(COLLISION_M, color=RED, ls="--", lw=1)
+        ax.set(xlabel="delay (ms)", title=f"lag {lag:g} s", ylim=(0, None))
+    axes[0, 0].set_ylabel("least distance of all seeds (m)")
+    axes[0, 0].legend(loc="lower left", fontsize=7)
+    return Figure("headon", "Least distance of two vehicles sent at each other; 0.5 m is a collision.", fig)
