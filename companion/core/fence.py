@@ -13,7 +13,7 @@ barrier 2 v/p before the margin and brakes with p v/e at most.
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from math import e, hypot, inf
+from math import e, hypot, inf, isfinite
 from typing import NamedTuple
 
 from companion.core.frames import Ned
@@ -104,8 +104,8 @@ class Fence:
         )
 
     def contains(self, position_ned_m: Ned) -> bool:
-        """Whether a place is inside; the margins are not counted."""
-        return self.clearance_m(position_ned_m) >= 0.0
+        """Whether a place is inside; the margins are not counted. One that is not finite is not."""
+        return all(map(isfinite, position_ned_m)) and self.clearance_m(position_ned_m) >= 0.0
 
     def edge_room_m(self, north: float, east: float) -> float:
         """Level distance to the edge's margin; negative beyond it."""

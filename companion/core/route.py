@@ -14,6 +14,8 @@ from companion.core.values import ZERO
 
 STEP_M = 0.25
 """shortest way between two looks"""
+OUTSIDE_STEP = 1.0 / 16.0
+"""outside, the way to the next look is this part of the depth, so that the worst is told to some per cent"""
 TOLERANCE_M = 1e-6
 SPEED_LOOKS = 16
 SPEED_ALLOWANCE = 1.1
@@ -125,29 +127,41 @@ def first_breach(motion: Motion, fence: Fence | None) -> Breach | None:
     """The first leg that leads a slot beyond the fence's margin, with the worst of that leg; None if all stay inside.
 
     The motion is marched along: the next look is when a slot could first touch the margin, and at least STEP_M on. A
-    motion that starts outside may lead back, no further out than it starts.
+    motion that starts beyond the margin is a way back if it ends no further out, whatever it passes: the safety filter
+    holds the vehicles meanwhile.
     """
     if fence is None or not motion.slots:
         return None
     extent = _extent(motion)
+    stretches = list(_stretches(motion))
     level, vertical, _ = _room(motion, fence, extent, motion.start_ns)
     allowed = min(level, vertical, 0.0) - TOLERANCE_M
-    for stretch in _stretches(motion):
-        level_m_s, vertical_m_s = _speeds(motion, extent, stretch)
-        worst: Breach | None = None
-        now_ns = stretch.start_ns
-        while True:
-            level, vertical, vehicle = _room(motion, fence, extent, now_ns)
-            room = min(level, vertical)
-            if room < allowed and (worst is None or -room > worst.outside_m):
-                worst = Breach(stretch.leg, vehicle, -room, (now_ns - motion.start_ns) * 1e-9)
-            if now_ns >= stretch.end_ns:
-                break
-            step_s = min(max(abs(level), STEP_M) / level_m_s, max(abs(vertical), STEP_M) / vertical_m_s)
-            now_ns = min(now_ns + round(step_s * 1e9), stretch.end_ns)
+    if allowed < -2.0 * TOLERANCE_M:
+        end = stretches[-1]
+        level, vertical, vehicle = _room(motion, fence, extent, end.end_ns)
+        room = min(level, vertical)
+        return Breach(end.leg, vehicle, -room, (end.end_ns - motion.start_ns) * 1e-9) if room < allowed else None
+    for stretch in stretches:
+        worst = _worst(motion, fence, extent, stretch, allowed)
         if worst is not None:
             return worst
     return None
+
+
+def _worst(motion: Motion, fence: Fence, extent: _Extent, stretch: _Stretch, allowed_m: float) -> Breach | None:
+    level_m_s, vertical_m_s = _speeds(motion, extent, stretch)
+    worst: Breach | None = None
+    now_ns = stretch.start_ns
+    while True:
+        level, vertical, vehicle = _room(motion, fence, extent, now_ns)
+        room = min(level, vertical)
+        if room < allowed_m and (worst is None or -room > worst.outside_m):
+            worst = Breach(stretch.leg, vehicle, -room, (now_ns - motion.start_ns) * 1e-9)
+        if now_ns >= stretch.end_ns:
+            return worst
+        way_level, way_vertical = (max(x, -OUTSIDE_STEP * x, STEP_M) for x in (level, vertical))
+        step_s = min(way_level / level_m_s, way_vertical / vertical_m_s)
+        now_ns = min(now_ns + round(step_s * 1e9), stretch.end_ns)
 
 
 def only_stops(motion: Motion, before: Motion) -> bool:

@@ -7,7 +7,7 @@ what the law says is replaced, just before the filter, by a command that flies a
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from itertools import product
-from math import dist, hypot
+from math import dist
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -16,9 +16,9 @@ import numpy as np
 
 from companion.config import FleetConfig, parse
 from companion.core.frames import Ned
-from companion.core.safety import SafetyFilter
-from companion.core.values import Command, Neighbour, Phase, SafeSetpoint, VehicleState
+from companion.core.values import Phase
 from companion.errors import ConfigError
+from sim.broken_law import BrokenLaw
 from sim.lockstep import Lockstep
 from sim.network import NetworkParameters
 from sim.study.common import Column, Config, Figure, Outcome, Record, Table, proportion_text
@@ -33,8 +33,6 @@ COLLISION_M = 0.5
 BAR_M = 0.85
 READY_S = 30.0
 MEETING_S = 16.0
-GAIN_PER_S = 3.0
-PUSH_MAX_M_S2 = 5.0
 SCATTER_M = 0.05
 """how far the two pads' lines lie apart at most"""
 
@@ -53,31 +51,8 @@ class Meeting:
     gust_m_s2: float
 
 
-@dataclass(slots=True)
-class BrokenLaw(SafetyFilter):
-    """The filter of a vehicle whose law flies at the other one, whatever the plan and its peers say."""
-
-    velocity_ned_m_s: Ned | None = None
-    """None: the law is sound"""
-
-    def apply(
-        self,
-        command: Command,
-        ego: VehicleState,
-        neighbours: Sequence[Neighbour],
-        velocity_bias_ned_m_s: Ned,
-        dt_s: float,
-    ) -> SafeSetpoint | None:
-        """Filter the broken law's command instead of the given one."""
-        if self.velocity_ned_m_s is not None:
-            wanted, v = self.velocity_ned_m_s, ego.velocity_ned_m_s
-            north, east = GAIN_PER_S * (wanted.north - v.north), GAIN_PER_S * (wanted.east - v.east)
-            over = max(hypot(north, east) / PUSH_MAX_M_S2, 1.0)
-            command = command._replace(acceleration_ned_m_s2=Ned(north / over, east / over, 0.0))
-        return SafetyFilter.apply(self, command, ego, neighbours, velocity_bias_ned_m_s, dt_s)
-
-
-def _meeting(config: Config) -> Meeting:
+def meeting_of(config: Config) -> Meeting:
+    """The set-up's meeting; a missing or unknown key is refused."""
     given = dict(config.values.get("meeting", {}))
     known = {f.name for f in fields(Meeting)}
     if set(given) != known:
@@ -145,7 +120,7 @@ def _cells(meeting: Meeting) -> list[tuple[float, float, float]]:
 
 def piece(config: Config, seed: int) -> Record:
     """Every meeting under one seed."""
-    meeting = _meeting(config)
+    meeting = meeting_of(config)
     return {
         "cells": [meet(meeting, seed, lag_s=g, delay_s=d, loss=x) for g, x, d in _cells(meeting)],
         "compared": [meet(meeting, seed, **given) for given in config.values.get("compared", [])],
@@ -166,7 +141,7 @@ def _row(records: Sequence[Record]) -> Record:
 
 def finish(config: Config, pieces: Sequence[Record], seeds: Sequence[int]) -> Outcome:
     """The table, the edge of the safe region, and the distance over the delay."""
-    meeting = _meeting(config)
+    meeting = meeting_of(config)
     outcome = Outcome()
     rows: list[Record] = []
     for k, (lag, loss, delay) in enumerate(_cells(meeting)):

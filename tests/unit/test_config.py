@@ -21,6 +21,7 @@ from companion.config import (
     serial_endpoint,
     udp_endpoint,
 )
+from companion.core.fence import Fence
 from companion.core.plan import GotoLeg, TurnLeg, VelocityLeg
 from companion.errors import ConfigError
 from sim.__main__ import _resize, plan_legs
@@ -153,6 +154,11 @@ RANGES = [
     ("limits.jerk_max_m_s3", -1.0, "a finite number > 0 and <= 1000 m/s^3"),
     ("limits.avoidance_acceleration_m_s2", 8.5, "a finite number > 0 and <= 8 m/s^2"),
     ("limits.barrier", "yes", "a valid boolean"),
+    ("fence.radius_m", 0.0, "a finite number > 0 and <= 100000 m"),
+    ("fence.floor_m", -501.0, "a finite number >= -500 and <= 1000 m"),
+    ("fence.ceiling_m", 1001, "a finite number >= -500 and <= 1000 m"),
+    ("fence.margin_m", -0.1, "a finite number >= 0 and <= 100 m"),
+    ("fence.vertical_margin_m", 100.5, "a finite number >= 0 and <= 100 m"),
     ("peers.digest", 31, "a whole number >= 0 and <= 30"),
     ("peers.digest", 2.0, "a whole number >= 0 and <= 30"),
     ("peers.network", "mesh", "'laptop' or 'field'"),
@@ -195,6 +201,7 @@ def test_a_value_out_of_its_range_is_refused_with_place_value_and_range(path: st
     [
         ("colour", "fence, fleet, formation, launch"),
         ("fleet.colour", "frame, name, origin"),
+        ("fence.colour", "ceiling_m, centre_m, floor_m, margin_m, polygon_m, radius_m, vertical_margin_m"),
         ("fleet.origin.colour", "altitude_amsl_m, latitude_deg, longitude_deg"),
         ("law.colour", "a_max_m_s2"),
         ("vehicle.3.colour", "enabled, id, mavlink"),
@@ -263,6 +270,24 @@ def legs(*rows: dict[str, object]) -> Change:
     return put("plan.legs", list(rows))
 
 
+def fence(**table: object) -> Change:
+    return put("fence", {"floor_m": 2.0, "ceiling_m": 50.0, **table})
+
+
+def line_within(radius_m: float) -> Change:
+    """Ten in line are 36 m wide."""
+
+    def change(tables: Tables) -> None:
+        tables["formation"]["shape"] = "line"
+        tables["fence"]["radius_m"] = radius_m
+
+    return change
+
+
+def polygon(*corners: list[int]) -> Change:
+    return fence(polygon_m=list(corners))
+
+
 ACROSS = [
     (put("formation.spacing_m", 1.5), "$.formation.spacing_m", "the safety radius 1.49 m", "got 1.50 m"),
     (put("law.r0_m", 5.0), "$.formation.spacing_m", "separation's range 5.00 m", "got 4.00 m"),
@@ -288,6 +313,29 @@ ACROSS = [
     (drop(f"{TURN}.angle_deg"), "$.plan.legs[1].angle_deg", "is required except in the last leg", ""),
     (legs({"kind": "goto", "north_m": 5.0, "east_m": 0.0, "speed_m_s": 3.5}), "$.plan.legs[0].speed_m_s",
      "<= 3 m/s", "got 3.5"),
+    (put("fence.polygon_m", [[-90, -90], [90, -90], [90, 90]]), "$.fence", "radius_m or polygon_m", "got both"),
+    (polygon([-90, -90], [90, -90]), "$.fence.polygon_m", "at least 3 corners", "got 2"),
+    (polygon([-90, -90], [90, 90], [90, -90], [-90, 90]), "$.fence.polygon_m", "not cross or touch itself",
+     "got Self-intersection[0 0]"),
+    (polygon([-90, -90], [90, -90], [90, -90], [-90, -90]), "$.fence.polygon_m", "not cross or touch itself", "got"),
+    (polygon([-90, -1], [90, -1], [90, 1], [-90, 1]), "$.fence.polygon_m", "wider than twice $.fence.margin_m = 2 m",
+     "got nothing inside"),
+    (fence(centre_m=[0.0, 0.0]), "$.fence.centre_m", "belongs to radius_m", "missing"),
+    (put("fence.radius_m", 2.0), "$.fence.radius_m", "> $.fence.margin_m = 2 m", "got 2"),
+    (put("fence.ceiling_m", 2.5), "$.fence.ceiling_m", "at least 1 m", "got 2.5"),
+    (drop("fence.floor_m"), "$.fence.floor_m", "is required", ""),
+    (put("vehicle.2.pad_m", [199.0, 0.0]), "$.vehicle[2].pad_m", "inside the fence by $.fence.margin_m = 2 m",
+     "got [199, 0], 1.00 m too far out"),
+    (put("formation.altitude_m", 2.4), "$.formation.altitude_m", ">= 2.5 and <= 49.5 m", "got 2.4"),
+    (put("formation.altitude_m", 49.6), "$.formation.altitude_m", ">= 2.5 and <= 49.5 m", "got 49.6"),
+    (line_within(19.0), "$.formation", "must be inside the fence by its margin", "got 1.00 m beyond it"),
+    (put("fence.radius_m", 32.0), "$.plan.legs[0]", "must stay inside the fence by its margin", "got vehicle"),
+    (legs({"kind": "hold", "duration_s": 1.0}, {"kind": "goto", "north_m": 500.0, "east_m": 0.0}), "$.plan.legs[1]",
+     "must stay inside the fence", "m beyond it"),
+    (legs({"kind": "velocity", "north_m_s": 2.9, "duration_s": 20.0}, {"kind": "turn", "rate_deg_s": 1.0}),
+     "$.plan.legs[1]", "must stay inside the fence", "s into the plan"),
+    (legs({"kind": "velocity", "up_m_s": 1.0, "duration_s": 60.0}), "$.plan.legs[0]", "inside the fence",
+     "got vehicle"),
 ]  # fmt: skip
 
 
@@ -298,6 +346,34 @@ def test_values_that_do_not_go_together_are_refused(change: Change, where: str, 
     assert where in text
     assert allowed in text
     assert came in text
+
+
+def test_the_fence_of_the_file_is_what_the_safety_filter_keeps() -> None:
+    config = load(DEFAULT)
+    assert config.safety_limits.fence == config.geofence == Fence(2.0, 50.0, radius_m=200.0)
+    assert parse(changed(drop("fence")), "fleet.toml").safety_limits.fence is None
+    corners = ([-90, -90], [90, -90], [90, 90], [-90, 90])
+    parsed = parse(changed(polygon(*corners)), "fleet.toml").geofence
+    assert parsed is not None
+    assert parsed.corners_m == tuple(map(tuple, corners))
+    assert parsed.margin_m == 2.0
+    low = parse(changed(fence()), "fleet.toml").geofence
+    assert low is not None
+    assert low.edge_clearance_m(1e4, 0.0) == INF
+
+
+@pytest.mark.parametrize(("radius", "inside"), [(51.3, True), (51.0, False)])
+def test_the_plan_of_the_file_reaches_to_49_m_and_the_margin(radius: float, inside: bool) -> None:
+    tables = changed(put("fence.radius_m", radius))
+    if inside:
+        parse(tables, "fleet.toml")
+    else:
+        with pytest.raises(ConfigError, match=r"\$\.plan\.legs\[\d\] must stay inside the fence"):
+            parse(tables, "fleet.toml")
+
+
+def test_without_a_fence_a_plan_may_lead_anywhere() -> None:
+    parse(changed(drop("fence"), legs({"kind": "goto", "north_m": 5000.0, "east_m": 0.0})), "fleet.toml")
 
 
 def test_all_faults_are_told_at_once_each_on_its_line() -> None:
@@ -363,6 +439,8 @@ def test_whatever_stands_in_one_place_the_file_loads_or_is_refused(path: str, va
         (put("vehicle.9.enabled", False), False),
         (put("fleet.name", "other"), False),
         (put("plan.then", "stay"), False),
+        (put("fence.radius_m", 199.0), False),
+        (drop("fence"), False),
     ],
 )
 def test_the_shared_hash_tells_what_vehicles_must_agree_on_and_nothing_else(change: Change, shared: bool) -> None:

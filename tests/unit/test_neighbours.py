@@ -452,6 +452,20 @@ def test_a_lost_peer_is_a_neighbour_while_either_of_its_ends_is_in_range() -> No
     assert t.predict(out, now, moment, False) == []
 
 
+@pytest.mark.parametrize(("beside_m", "heard"), [(0.9, 1), (0.999, 1), (1.001, 0), (1.5, 0)])
+def test_a_lost_peer_is_a_neighbour_beside_the_middle_of_its_line(beside_m: float, heard: int) -> None:
+    """Both its ends are out of range; somewhere between them it may be within."""
+    t = table(range_m=1.0)
+    t.accept(message(sample(t, 2, 0.0)), at(0.0))
+    t.presence(2, False, at(0.5))
+    now = at(20.0)
+    last, stopped = (t.programme.reference(2, ns(x)).position_ned_m for x in (5.5, 0.0))
+    assert dist(last, stopped) > 3.0
+    middle = [0.5 * (a + b) for a, b in zip(last, stopped, strict=True)]
+    ego = Ned(middle[0], middle[1], middle[2] - beside_m)
+    assert len(t.predict(ego, now, t.programme.newest.moment(now.fleet_ns), False)) == heard
+
+
 @pytest.mark.parametrize("phase", [Phase.LANDED, Phase.LANDING, Phase.RELEASED, Phase.CLIMBING])
 def test_a_lost_peer_that_was_not_in_formation_has_one_place(phase: Phase) -> None:
     t = table()

@@ -25,6 +25,7 @@ from companion.core.safety import (
     half_plane,
     nearest_feasible,
     nearest_hypothesis,
+    out_of_reach,
     safety_radius_m,
 )
 from companion.core.values import Command, Neighbour, SafeSetpoint, VehicleState
@@ -258,6 +259,81 @@ def test_flying_along_a_lost_peers_segment_carries_nobody_away_from_it(ego: Ned,
 def test_a_lost_peer_whose_ends_meet_has_one_place() -> None:
     a = Ned(1.0, 2.0, 3.0)
     assert nearest_hypothesis(ZERO, peer(a, Ned(1.0, 0.0, 0.0), other_end_ned_m=a)) == (a, (1.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("uncertainty", [0.0, 0.35, 1.0])
+@pytest.mark.parametrize(("share", "kept"), [(0.999, False), (1.0, True), (1.001, True)])
+def test_distance_at_the_safety_radius(share: float, kept: bool, uncertainty: float) -> None:
+    """At rest: just inside it is pushed away, at it and just outside it may stay."""
+    place = Ned(share * (COLLISION_DISTANCE_M + LAG_ALLOWANCE_M + uncertainty), 0.0, 0.0)
+    f = SafetyFilter(LIMITS)
+    s = applied(f, command(), state(), [peer(place, uncertainty_m=uncertainty)])
+    assert (acceleration(s) == (0.0, 0.0)) is kept
+    assert s.acceleration_north_m_s2 <= 0.0
+    assert f.counts == ({} if kept else {"peer distance": 1})
+
+
+@pytest.mark.parametrize(("share", "kept"), [(0.99, False), (1.0, True), (1.01, True)])
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_distance_at_the_downwash(share: float, kept: bool, side: float) -> None:
+    """Above or below one another, 2.5 times the safety radius is as near as it gets."""
+    f = SafetyFilter(LIMITS)
+    s = applied(f, command(), state(), [peer(Ned(0.1, 0.0, side * share * 2.5), uncertainty_m=0.35)])
+    assert (acceleration(s) == (0.0, 0.0)) is kept
+    assert f.counts["peer distance"] == (0 if kept else 1)
+
+
+# -- peers out of reach ------------------------------------------------------------------------------------------------
+
+far = st.builds(Ned, st.floats(-80.0, 80.0), st.floats(-80.0, 80.0), st.floats(-60.0, 60.0))
+fast = st.builds(Ned, *[st.floats(-12.0, 12.0)] * 3)
+
+
+@settings(deadline=None, max_examples=500)
+@given(far, fast, far, fast, level, level, st.booleans(), st.floats(0.0, 3.0), st.floats(0.1, 8.0), st.floats(-pi, pi))
+def test_a_peer_out_of_reach_binds_no_command(
+    p: Ned, v: Ned, q: Ned, w: Ned, s: Ned, t: Ned, shares: bool, uncertainty_m: float, most: float, angle: float
+) -> None:
+    n = peer(q, w, shares=shares, uncertainty_m=uncertainty_m, reference_acceleration_ned_m_s2=t)
+    if out_of_reach(state(p, v), s, n, most):
+        plane = half_plane(state(p, v), s, n)
+        assert most * (plane.g_north * cos(angle) + plane.g_east * sin(angle)) >= plane.b
+        assert plane.b <= -most * hypot(plane.g_north, plane.g_east) + 1e-9
+
+
+@pytest.mark.parametrize("shares", [True, False])
+@pytest.mark.parametrize("closing", [0.0, 2.0, 8.0])
+def test_the_reach_is_not_much_longer_than_it_must_be(shares: bool, closing: float) -> None:
+    """Where a peer is within reach some command comes near its edge: at three quarters of the way it is broken."""
+    n = [peer(Ned(0.1 * k, 0.0, 0.0), shares=shares) for k in range(10, 600)]
+    ego = state(velocity=Ned(closing, 0.0, 0.0))
+    reach = max(x.position_ned_m.north for x in n if not out_of_reach(ego, ZERO, x, 8.0))
+    plane = half_plane(ego, ZERO, peer(Ned(0.75 * reach, 0.0, 0.0), shares=shares))
+    assert plane.b > -8.0 * hypot(plane.g_north, plane.g_east)
+
+
+@PROPERTY
+@given(
+    st.lists(st.tuples(st.floats(0.3, 40.0), st.floats(-pi, pi), st.floats(-3, 3), st.floats(-3, 3)), max_size=12),
+    commands_2d, st.booleans(),
+)  # fmt: skip
+def test_leaving_out_what_is_out_of_reach_changes_no_setpoint(
+    crowd: list[tuple[float, float, float, float]], u: tuple[float, float], shares: bool
+) -> None:
+    """A lost peer whose line is a point is the same obstacle, and never left out."""
+    quick, full = SafetyFilter(LIMITS), SafetyFilter(LIMITS)
+    near, lines = [], []
+    for k, (r, a, v, w) in enumerate(crowd):
+        place = Ned(r * cos(a), r * sin(a), 0.0)
+        near.append(peer(place, Ned(v, w, 0.0), vehicle_id=k + 2, shares=shares))
+        lines.append(near[-1]._replace(other_end_ned_m=place))
+    assert applied(quick, command(Ned(*u, 0.0)), state(), near) == applied(full, command(Ned(*u, 0.0)), state(), lines)
+    assert quick.counts == full.counts
+
+
+@pytest.mark.parametrize("place", [inf, nan, 1e7, 1e160])
+def test_a_peer_at_no_place_is_never_out_of_reach(place: float) -> None:
+    assert not out_of_reach(state(), ZERO, peer(Ned(place, 0.0, 0.0)), 8.0)
 
 
 @pytest.mark.parametrize("above", [0.0, 1e-6, 0.3, -0.3])

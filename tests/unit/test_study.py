@@ -1,6 +1,7 @@
 """The studies: shape of their results with a few seeds, refusals, and that finished seeds are not run again."""
 
 import json
+import re
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
@@ -16,7 +17,7 @@ from companion.core.frames import Ned
 from companion.core.values import PeerMessage, PeerSample, Phase
 from companion.errors import ConfigError
 from companion.wire.peer import encode_state
-from sim.study import common
+from sim.study import common, headon
 from sim.study.cli import study
 from sim.study.common import load_config, measured, parse_seeds, proportion_interval
 from sim.study.faults import _ablated
@@ -201,3 +202,39 @@ def test_bytes_are_counted_as_the_wire_has_them() -> None:
     assert len(encode_state(message)) == common.MESSAGE_BYTES
     longer = PeerMessage(1, 1, 0, 0, sample, (other,))
     assert len(encode_state(longer)) == common.MESSAGE_BYTES + common.DIGEST_ENTRY_BYTES
+
+
+def test_two_sent_head_on_by_a_broken_law_keep_their_distance_and_without_the_filter_collide() -> None:
+    """The bar's row of the table, on three seeds: 0.3 s of lag, 100 ms of delay, event-triggered."""
+    meeting = headon.meeting_of(load_config("headon"))
+    assert meeting.speed_m_s == 2.0
+    for seed in range(3):
+        kept = headon.meet(meeting, seed, lag_s=0.3, delay_s=0.1, loss=0.0)
+        assert kept["minimum_distance_m"] >= headon.BAR_M
+        assert kept["passed"]
+        assert kept["messages"] < 100
+    without = headon.meet(meeting, 0, lag_s=0.3, delay_s=0.1, loss=0.0, barrier=False)
+    assert without["minimum_distance_m"] < headon.COLLISION_M
+
+
+def test_the_head_on_study_writes_its_table_and_the_edge_of_the_safe_region(tmp_path: Path) -> None:
+    setup = tmp_path / "small.toml"
+    text = Path(headon.__file__).with_suffix(".toml").read_text(encoding="utf-8")
+    for key, values in (("lags_s", [0.3]), ("delays_s", [0.0, 0.1]), ("losses", [0.0])):
+        text = re.sub(rf"^{key} = .*", f"{key} = {values}", text, flags=re.MULTILINE)
+    setup.write_text(text, encoding="utf-8")
+    study("headon", "0", tmp_path, setup=setup, console=_quiet())
+    found = json.loads((tmp_path / "headon.json").read_text(encoding="utf-8"))
+    assert [(r["lag_s"], r["delay_ms"]) for r in found["rows"]] == [(0.3, 0.0), (0.3, 100.0)]
+    assert found["edges"] == [{"lag_s": 0.3, "loss_percent": 0.0, "safe_ms": 100.0, "bar_ms": 100.0}]
+    assert [r["close_count"] for r in found["compared"]] == [0, 1]
+    for name in ("headon_table.csv", "headon_edge.csv", "headon.png", "headon.svg", "headon.html"):
+        assert (tmp_path / name).stat().st_size > 0
+
+
+@pytest.mark.parametrize(("missing", "more"), [("gust_m_s2", ""), ("", "speed")])
+def test_a_head_on_set_up_with_missing_or_unknown_keys_is_refused(missing: str, more: str) -> None:
+    config = load_config("headon")
+    given = {k: v for k, v in config.values["meeting"].items() if k != missing} | ({more: 2.0} if more else {})
+    with pytest.raises(ConfigError, match=f"wrong: {missing or more}$"):
+        headon.meeting_of(replace(config, values={"meeting": given}))
