@@ -31,7 +31,9 @@ SOURCES = tuple(
 """everything that flies here: finished seeds are run anew when any of it changes"""
 COLLISION_M = 0.5
 BAR_M = 0.85
-READY_S = 30.0
+READY_S = 200.0
+"""on the ground they speak every 8 to 10 s: at 50 % loss it takes a while until both have heard each other"""
+CLIMB_S = 30.0
 MEETING_S = 16.0
 SCATTER_M = 0.05
 """how far the two pads' lines lie apart at most"""
@@ -92,9 +94,9 @@ def meet(meeting: Meeting, seed: int, *, lag_s: float, delay_s: float, loss: flo
         v.agent.safety = laws[i] = BrokenLaw(config.safety_limits)
     fleet.run_until(READY_S, lambda: not any(v.agent.unready(fleet.now) for v in fleet.vehicles.values()))
     fleet.command(b'{"verb":"takeoff"}')
-    fleet.run_until(fleet.now_ns * 1e-9 + READY_S, lambda: fleet.all_in(Phase.FORMING))
+    fleet.run_until(fleet.now_ns * 1e-9 + CLIMB_S, lambda: fleet.all_in(Phase.FORMING))
     if not fleet.all_in(Phase.FORMING):
-        raise ConfigError(f"head-on: the two are not in the air after {READY_S:g} s: {fleet.notes}")
+        raise ConfigError(f"head-on: the two are not in the air {CLIMB_S:g} s after the command: {fleet.notes}")
     start_ns, sent = fleet.now_ns, len(fleet.sent)
     for i, way in ((1, 1.0), (2, -1.0)):
         laws[i].velocity_ned_m_s = Ned(way * meeting.speed_m_s, 0.0, 0.0)
