@@ -16,6 +16,8 @@ STEP_M = 0.25
 """shortest way between two looks"""
 OUTSIDE_STEP = 1.0 / 16.0
 """outside, the way to the next look is this part of the depth, so that the worst is told to some per cent"""
+LOOKS_MAX = 4000
+"""most looks at one leg: a leg of weeks beside the edge must not stop a vehicle"""
 TOLERANCE_M = 1e-6
 SPEED_LOOKS = 16
 SPEED_ALLOWANCE = 1.1
@@ -151,6 +153,7 @@ def first_breach(motion: Motion, fence: Fence | None) -> Breach | None:
 def _worst(motion: Motion, fence: Fence, extent: _Extent, stretch: _Stretch, allowed_m: float) -> Breach | None:
     level_m_s, vertical_m_s = _speeds(motion, extent, stretch)
     worst: Breach | None = None
+    least_ns = (stretch.end_ns - stretch.start_ns) // LOOKS_MAX
     now_ns = stretch.start_ns
     while True:
         level, vertical, vehicle = _room(motion, fence, extent, now_ns)
@@ -161,7 +164,7 @@ def _worst(motion: Motion, fence: Fence, extent: _Extent, stretch: _Stretch, all
             return worst
         way_level, way_vertical = (max(x, -OUTSIDE_STEP * x, STEP_M) for x in (level, vertical))
         step_s = min(way_level / level_m_s, way_vertical / vertical_m_s)
-        now_ns = min(now_ns + round(step_s * 1e9), stretch.end_ns)
+        now_ns = min(now_ns + max(round(step_s * 1e9), least_ns, 1), stretch.end_ns)
 
 
 def only_stops(motion: Motion, before: Motion) -> bool:

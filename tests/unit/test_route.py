@@ -1,6 +1,7 @@
 """Plans and the fence: what leads outside is found, on which leg and how far; what stays inside is not."""
 
 import math
+import time
 from dataclasses import replace
 from math import inf, pi, radians
 
@@ -157,6 +158,13 @@ def test_only_what_brings_the_same_formation_to_rest_only_stops() -> None:
     assert not only_stops(replace(hold, legs=()), flying)
     assert not only_stops(replace(hold, legs=flying.legs), flying)
     assert not only_stops(replace(hold, slots=motion(shape="line").slots), flying)
+
+
+def test_a_leg_of_months_beside_the_edge_is_looked_at_in_bounded_time() -> None:
+    beside = replace(alone(VelocityLeg(ZERO, 1e7)), centre_ned_m=Ned(47.999, 0.0, -10.0))
+    began = time.perf_counter()
+    assert first_breach(beside, FENCE) is None
+    assert time.perf_counter() - began < 5.0
 
 
 def test_without_a_fence_everything_is_inside() -> None:
