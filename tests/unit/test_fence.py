@@ -514,7 +514,8 @@ def outward(fence: Fence) -> Push:
 def test_no_law_and_no_gust_of_1_m_s2_takes_a_vehicle_out_of_the_fence(
     fence: Fence, place: tuple[float, float], seed: int, lag_s: float, delay_s: float, change_s: float
 ) -> None:
-    """From rest inside; the law pushes outward or anywhere, the gust is as large as it gets and turns at will."""
+    """From rest inside; the law pushes outward or anywhere, the gust is as large as it gets and turns at will. Half of
+    the margin stays."""
     if fence.edge_room_m(*place) < 0.1:
         return
     rng = random.Random(seed)
@@ -532,7 +533,7 @@ def test_no_law_and_no_gust_of_1_m_s2_takes_a_vehicle_out_of_the_fence(
         return (-wall.north, -wall.east) if honest[-1 - k] else (cos(turns[-1 - k]), sin(turns[-1 - k]))
 
     start = Ned(*place, LEVEL_M)
-    assert fly(fence, start, ZERO, push, lag_s=lag_s, delay_s=delay_s, gust=gust) > 0.0
+    assert fly(fence, start, ZERO, push, lag_s=lag_s, delay_s=delay_s, gust=gust) > 1.0
 
 
 def test_a_vehicle_blown_out_comes_back_slowly_and_stays() -> None:
