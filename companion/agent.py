@@ -36,6 +36,7 @@ from companion.core.trigger import exceeds, switching_exceeds
 from companion.core.values import (
     FILTERED_PHASES,
     FLYING_PHASES,
+    FORMATION_PHASES,
     SETTLED_PHASES,
     ZERO,
     Command,
@@ -515,8 +516,13 @@ class Agent:
         measured = None if self.flight.positions.frozen else self.autopilot.state(now)
         self.flight.watch(now, measured is not None)
         if self.phase is not self._announced:
+            both = {self.phase, self._announced}
+            if not both <= FORMATION_PHASES:
+                self._announce(now)
+            elif not both <= SETTLED_PHASES:
+                # Who moves and who rests follows from the plan, which all have.
+                self._mention(now)
             self._announced = self.phase
-            self._announce(now)
         if measured is None:
             if self._resend_ns:
                 # Whoever no longer knows where it is still says so, from the last place it knew.
@@ -583,7 +589,7 @@ class Agent:
         for n in neighbours:
             q, w, d = n.position_ned_m, n.velocity_ned_m_s, n.offset_ned_m
             dx, dy, dz = p.north - q.north, p.east - q.east, p.down - q.down
-            if n.in_formation and self.phase is not Phase.APART:
+            if n.in_formation and not self.flight.alone:
                 s = n.reference_velocity_ned_m_s
                 dvx, dvy = v.north - w.north - (rv.north - s.north), v.east - w.east - (rv.east - s.east)
                 shares.append(pair(dx, dy, dz, dvx, dvy, 0.0, d.north, d.east, dz, g))

@@ -392,8 +392,8 @@ class AutopilotClient:
         return inf if self.position_ns is None else (now.monotonic_ns - self.position_ns) * 1e-9
 
     def state(self, now: Instant) -> tuple[Ned, Ned] | None:
-        """Position and velocity now (fleet frame), the latest carried on by its age; None when stale."""
-        if self.position_ns is None:
+        """Position and velocity now (fleet frame), the latest carried on by its age; None if stale or without frame."""
+        if self.position_ns is None or self.frame is None:
             return None
         age_s = (now.monotonic_ns - self.position_ns) * 1e-9
         if age_s > POSITION_LIMIT_S:

@@ -144,6 +144,11 @@ class Flight:
             or self._orders.resume_ns is not None
         )
 
+    @property
+    def alone(self) -> bool:
+        """Whether it flies by itself: the formation does not draw it."""
+        return self.phase is Phase.APART or self._orders.resume_ns is not None
+
     # -- the operator's commands: each returns why it is refused, or None ----------------------------------------------
 
     def take_off(self, now: Instant) -> None:

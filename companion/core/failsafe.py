@@ -167,7 +167,7 @@ FAILSAFES: dict[Failsafe, Row] = {
     ),
     Failsafe.DISK_FULL: Row("the first write that fails", None, Action.CONTINUE, "losses are counted", "there is room"),
     Failsafe.CONFIGURATION: Row(
-        "5 s", CONFIGURATION_S, Action.CONTINUE, "noted; the vehicle flies on what it was started with", "a new start",
+        "5 s", None, Action.CONTINUE, "noted; the vehicle flies on what it was started with", "a new start",
     ),
     Failsafe.KILLED: Row(
         "the autopilot's COM_OF_LOSS_T (1.0 s)", 1.0, Action.HAND_OVER,

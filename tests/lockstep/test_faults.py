@@ -1,13 +1,13 @@
 """Flights in which something fails: a companion, the network, a pilot's patience."""
 
 import json
-from collections.abc import Iterable
 from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
 from flights import (
+    InLockstep,
     check_setpoint,
     distances,
     errors,
@@ -254,24 +254,6 @@ def test_two_halves_that_do_not_hear_each_other_fly_on_and_are_one_formation_aft
 
 
 # -- the operator ----------------------------------------------------------------------------------------------------
-
-
-class InLockstep:
-    """The operator's link into a fleet in lockstep."""
-
-    def __init__(self, ls: Lockstep) -> None:
-        self.ls = ls
-
-    def ask(
-        self, vehicle_ids: Iterable[int], kind: str, payload: bytes, timeout_s: float, retry_s: float
-    ) -> dict[int, bytes | None]:
-        if kind == "command":
-            answers = self.ls.command(payload, *vehicle_ids)
-        else:
-            answers = {
-                i: json.dumps(v.agent.status(self.ls.now)).encode() for i, v in self.ls.vehicles.items() if v.alive
-            }
-        return {i: answers.get(i) for i in vehicle_ids}
 
 
 class Operated:
