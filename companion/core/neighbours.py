@@ -30,6 +30,8 @@ VERTICAL_DAMPING_S = 2.0
 FREE_DAMPING_S = 2.0
 """time in which the velocity of a vehicle fades that follows no plan that we know: the pilot's, or one apart"""
 PEER_ACCELERATION_M_S2 = 8.0
+PEER_SPEED_M_S = 8.0
+"""and no peer is faster than this beyond the velocity that it told"""
 PEER_MARGIN_M = 1.0
 PEER_MARGIN_M_S = 1.0
 """two samples of a peer further apart than this and PEER_ACCELERATION_M_S2 explain are no motion"""
@@ -180,6 +182,7 @@ class PeerTable:
         if jumped(
             (last.position_ned_m, last.velocity_ned_m_s), (sample.position_ned_m, sample.velocity_ned_m_s),
             (sample.time_ns - last.time_ns) * 1e-9, PEER_ACCELERATION_M_S2, PEER_MARGIN_M, PEER_MARGIN_M_S,
+            PEER_SPEED_M_S,
         ):  # fmt: skip
             lie = "a peer's state jumps"
         elif (
