@@ -42,7 +42,7 @@ def run(
         os.write(1, f"vehicle {vehicle}: {text}\n".encode())
 
     config = load(fleet)
-    settings = RunSettings(vehicle, record, sys.stdin.fileno() if launched else None, log)
+    settings = RunSettings(vehicle, record, sys.stdin.fileno() if launched else None, log, fleet)
     companion = Companion(config, settings, {"config": fleet.read_text(), "version": version("starling-fleet")})
     try:
         status = companion.run()

@@ -7,32 +7,38 @@ go in, bytes come out. It never reads a clock and never raises for what others s
 import json
 from collections import Counter
 from dataclasses import dataclass, field
-from math import dist, hypot
+from math import dist
 from random import Random
 from typing import Any
 
 from companion.autopilot import AutopilotClient
 from companion.config import FleetConfig
 from companion.core.estimate import BiasObserver, SendFilter
+from companion.core.failsafe import LATE_S, Failsafe
 from companion.core.frames import Ned, geodetic_to_ned
 from companion.core.law import finish, pair, separation, total
 from companion.core.neighbours import PeerTable, held
-from companion.core.phase import PhaseEvent, next_phase
 from companion.core.plan import (
+    PADS,
     Motion,
     Programme,
     Reference,
     assignment_matches,
     motion_order,
+    over_the_pads,
     top_speed_m_s,
     with_formation,
     with_legs,
+    with_return,
 )
 from companion.core.route import first_breach, only_stops
 from companion.core.safety import SafetyFilter
 from companion.core.trigger import exceeds, switching_exceeds
 from companion.core.values import (
     FILTERED_PHASES,
+    FLYING_PHASES,
+    FORMATION_PHASES,
+    SETTLED_PHASES,
     ZERO,
     Command,
     Instant,
@@ -44,9 +50,10 @@ from companion.core.values import (
     VehicleState,
 )
 from companion.errors import ConfigError, WireError
-from companion.preflight import POSITION_LIMIT_S, Account, Check, assignment_hash, own_checks, unmet
-from companion.wire import mavlink as wire
-from companion.wire.mavlink import MavlinkLink, Px4Mode, mode_name
+from companion.flight import Flight
+from companion.orders import REVISION_JUMP_MAX, Order, OrderBook, read_order
+from companion.preflight import Account, Check, assignment_hash, own_checks, unmet
+from companion.wire.mavlink import MavlinkLink, mode_name
 from companion.wire.peer import decode_motion, decode_state, encode_motion, encode_state
 
 TIMER_SLACK = 1.5
@@ -55,28 +62,19 @@ PROPOSAL_DELAY_NS = 3_000_000_000
 """how far ahead a vehicle proposes a start that follows by itself"""
 PROPOSAL_SPREAD_NS = 100_000_000
 """times the vehicles: what each waits at most before it proposes; the first of all comes after about this"""
-SETTLED_TOLERANCE_M = 0.6
-SETTLED_FOR_NS = 1_000_000_000
-ALTITUDE_TOLERANCE_M = 0.4
-CLIMB_LIMIT_NS = 60_000_000_000
-TAKE_OFF_LIMIT_NS = 10_000_000_000
-"""an autopilot that neither arms nor takes off within this is not asked any more"""
-HOLD_MARGIN_M = 1.0
-"""hold mode this far below the take-off's altitude is the pilot's doing, not the take-off's end"""
-OUR_MODES = frozenset({Px4Mode.AUTO_TAKEOFF, Px4Mode.AUTO_LOITER, Px4Mode.OFFBOARD})
-"""modes in which a vehicle may be while we fly it, but for landing"""
 RESEND_NS = (250_000_000, 1_000_000_000)
 """a change of phase or motion is repeated after these delays, since one message may be lost"""
+OUT_OF_FORMATION = frozenset({Phase.IDLE, Phase.APART, Phase.LANDING, Phase.LANDED, Phase.RELEASED})
+"""phases of peers for which nobody waits any more once the formation has been taken"""
+LEVEL_M_S = 1e-6
+RESENDS_MAX = 8
 CATCH_UP_NS = 1_000_000_000
 SPREAD_NS = 50_000_000
 """times the vehicles, up to CATCH_UP_NS: over this time they spread what all have reason to say at once"""
 PLAN_COPIES = 2
 """a plan that this many others have just told need not be told again"""
-POSITION_LOST_S = POSITION_LIMIT_S + 1.0
-"""setpoints end POSITION_LIMIT_S after the last position, and COM_OF_LOSS_T (1 s) later the autopilot acts"""
 LOOK_PERIOD_NS = 200_000_000
 """who does not steer looks at its peers this often: a crowd on the ground need not work as in the air"""
-FLYING = frozenset({Phase.ARMED, Phase.CLIMBING, Phase.FORMING, Phase.FORMED, Phase.LANDING})
 
 
 def adoption_note(motion: Motion) -> str:
@@ -122,8 +120,6 @@ class Agent:
         self.vehicle = config.by_id(vehicle_id)
         self.id = vehicle_id
         self.boot_id = boot_id
-        self.phase = Phase.IDLE
-        self.failsafes: list[str] = []
         self.rejected: Counter[str] = Counter()
         self.link = MavlinkLink(self.vehicle.system_id)
         origin = config.origin if config.fleet.frame == "global" else None
@@ -132,6 +128,8 @@ class Agent:
         others = frozenset(v.id for v in config.vehicles) - {vehicle_id}
         self.peers = PeerTable(vehicle_id, others, config.peer_limits, self.programme)
         self.safety = SafetyFilter(config.safety_limits)
+        self.flight = Flight(config, vehicle_id, self.autopilot, self.programme, self.peers, self.safety)
+        self.orders = OrderBook()
         self.messages_sent = 0
         self.setpoints_sent = 0
         self._gains = config.gains
@@ -142,12 +140,7 @@ class Agent:
         self._random = Random(vehicle_id << 32 | boot_id)
         self._bias = (BiasObserver(), BiasObserver(), BiasObserver())
         self._filter = (SendFilter(), SendFilter(), SendFilter())
-        self._take_off_wanted = False
-        self._take_off_since_ns = 0
-        self._mode_before: int | None = None
-        """custom_mode at arming, until the take-off: the vehicle may stay in it"""
         self._position_came = False
-        self._position_stale = False
         self._last_tick: Instant | None = None
         self._observed_ns: int | None = None
         """when the own state was last known"""
@@ -167,15 +160,17 @@ class Agent:
         self._spread_ns = min(SPREAD_NS * len(config.vehicles), CATCH_UP_NS)
         self._propose_ns: int | None = None
         """when to propose what follows, if nobody has by then (monotonic)"""
-        self._behind = False
-        self._phase_since_ns = 0
-        self._settled_since_ns: int | None = None
-        self._formation_since_ns: int | None = None
-        self._mode_asked_ns = 0
-        self._land_seen = False
+        self._announced = Phase.IDLE
+        """the phase that the peers were last told at once"""
+        self._jumps = 0
         self._assignment: str | None = None
         """hash of the first formation's assignment, once asked for"""
         self._outputs = Outputs()
+
+    @property
+    def phase(self) -> Phase:
+        """Where the vehicle is in its flight."""
+        return self.flight.phase
 
     # -- inputs ------------------------------------------------------------------------------------------------------
 
@@ -184,6 +179,9 @@ class Agent:
         heard = self.autopilot.heard
         if self.autopilot.receive(datagram, now):
             self._position_came = True
+            ap = self.autopilot
+            assert ap.position_ns is not None
+            self.flight.positions.see(ap.position_ns, ap.position_ned_m, ap.velocity_ned_m_s)
         return self.autopilot.heard > heard
 
     def receive_peer(self, key: str, payload: bytes, now: Instant) -> None:
@@ -214,32 +212,53 @@ class Agent:
     def receive_presence(self, vehicle_id: int, alive: bool, now: Instant) -> None:
         """A peer's process appeared or ended."""
         self.peers.presence(vehicle_id, alive, now)
-        if alive and vehicle_id in self.peers.ids and self.programme.newest.revision > 0 and self._plan_due_ns is None:
-            # Whoever comes late has our last state from the cache; the plan it may lack is told again.
+        if not alive or vehicle_id not in self.peers.ids:
+            return
+        # Whoever lost us believes us only by a new state, and whoever comes late may lack the plan.
+        delay_ns = self._random.randrange(self._spread_ns)
+        self._resend_ns = sorted([*self._resend_ns, now.monotonic_ns + delay_ns])[:RESENDS_MAX]
+        if self.programme.newest.revision > 0 and self._plan_due_ns is None:
             self._tell_plan_soon(now)
 
     def receive_command(self, payload: bytes, now: Instant) -> bytes:
-        """An operator's command as JSON; returns the answer as JSON."""
-        try:
-            command = json.loads(payload)
-            verb = command["verb"]
-        except (ValueError, KeyError, TypeError, RecursionError):
-            self.rejected["command: malformed"] += 1
-            return self._reply("not a command: needs a JSON object with a verb")
-        match verb:
+        """An operator's command as JSON; returns the answer as JSON. The same bytes again get the same answer."""
+        again = self.orders.answer_again(payload)
+        if again is not None:
+            return again
+        order = read_order(payload)
+        if isinstance(order, tuple):
+            kind, sentence = order
+            self.rejected[f"command: {kind}"] += 1
+            return self._reply(sentence)
+        refusal = self.orders.refusal(order)
+        if refusal is not None:
+            self.rejected["command: not in order"] += 1
+            return self._reply(refusal)
+        refusal = self._obey(order, now)
+        answer = self._reply(refusal)
+        self.orders.answered(order, payload, answer, refusal is None)
+        return answer
+
+    def _obey(self, order: Order, now: Instant) -> str | None:
+        """Do what is commanded; returns why not."""
+        match order.verb:
             case "takeoff":
-                return self._reply(self._command_take_off(now))
+                return self._command_take_off(now)
             case "land":
-                return self._reply(self._command_land(now))
-            case "motion":
-                try:
-                    motion = decode_motion(json.dumps(command.get("motion")).encode())
-                except WireError as error:
-                    self.rejected["command: motion"] += 1
-                    return self._reply(str(error))
-                return self._reply(self._consider(motion, now))
-        self.rejected["command: unknown verb"] += 1
-        return self._reply(f"unknown verb {verb!r}; known: takeoff, land, motion")
+                return self.flight.land(now)
+            case "release":
+                return self.flight.release(now)
+            case "resume":
+                return self.flight.resume(now)
+            case "kill":
+                confirmed = order.fields.get("confirm") is True
+                return self.flight.kill(now) if confirmed else "kill needs its confirmation"
+        try:
+            motion = decode_motion(json.dumps(order.fields.get("motion")).encode())
+        except WireError as error:
+            self.rejected["command: motion"] += 1
+            return str(error)
+        return self._consider(motion, now)
 
     def _reply(self, refusal: str | None) -> bytes:
         answer = {
@@ -252,36 +271,33 @@ class Agent:
         return json.dumps(answer).encode()
 
     def _command_take_off(self, now: Instant) -> str | None:
-        if self.phase in FLYING or self._take_off_wanted:
+        if self.phase in FLYING_PHASES or self.phase is Phase.PREFLIGHT:
             return None
         if self.phase is Phase.RELEASED:
             return "the pilot has the vehicle"
-        end_ns = self.programme.newest.end_ns
-        if self.programme.newest.then == "land" and end_ns is not None and now.fleet_ns >= end_ns:
+        newest = self.programme.newest
+        if newest.then == "land" and newest.end_ns is not None and now.fleet_ns >= newest.end_ns:
             return "the plan is over: restart the companions for another flight"
         reasons = self.unready(now)
         if reasons:
             return "; ".join(reasons)
-        self._happened(PhaseEvent.TAKE_OFF, now)
-        self._take_off_wanted, self._take_off_since_ns = True, now.monotonic_ns
+        self.flight.take_off(now)
         return None
 
-    def _command_land(self, now: Instant) -> str | None:
-        self._take_off_wanted = False
-        self.autopilot.withdraw("arming", "take-off")
-        if self.phase is Phase.RELEASED:
-            return "the pilot has the vehicle"
-        self._happened(PhaseEvent.LAND, now)
-        return None
+    def notice(self, failsafe: Failsafe, now: Instant) -> None:
+        """Something that only the process around can see: it is noted and counted, and changes nothing."""
+        del now
+        self.rejected[failsafe.value] += 1
+        self._outputs.notes.append(f"{failsafe.value}: noted")
 
     def stop(self, now: Instant) -> None:
         """The process is asked to end: land. `stopped` tells when the autopilot has taken over."""
-        self._command_land(now)
+        self.flight.land(now)
 
     @property
     def stopped(self) -> bool:
         """Whether nothing hangs in the air on this process."""
-        return self.phase not in FLYING or (self.phase is Phase.LANDING and self._land_seen)
+        return self.flight.stopped
 
     def unready(self, now: Instant) -> list[str]:
         """Why this vehicle may not take off; empty when it may."""
@@ -290,10 +306,10 @@ class Agent:
     def checks(self, now: Instant) -> tuple[Check, ...]:
         """Every row of this vehicle's own preflight."""
         place = None
-        if self.phase not in FLYING and self.programme.newest.revision == 0:
+        if self.phase not in FLYING_PHASES and self.programme.newest.revision == 0:
             place = Ned(self.vehicle.pad_north_m, self.vehicle.pad_east_m, 0.0)
         rows = own_checks(self.autopilot.facts(now), self.config, self.vehicle, place)
-        ours = self.phase not in (Phase.IDLE, Phase.LANDED) or self._take_off_wanted
+        ours = self.phase not in (Phase.IDLE, Phase.LANDED)
         strange = self.autopilot.armed and not ours
         silent = [i for i, phase in self.peers.phases().items() if phase is None]
         others = len(self.peers.ids)
@@ -321,7 +337,7 @@ class Agent:
             system_id=self.vehicle.system_id,
             configuration=self.config.shared_hash,
             assignment=self._assignment,
-            flying=self.phase in FLYING,
+            flying=self.phase in FLYING_PHASES,
             revision=self.programme.newest.revision,
             position_ned_m=facts.position_ned_m,
             slot_ned_m=self.programme.reference(self.id, now.fleet_ns).position_ned_m,
@@ -346,6 +362,8 @@ class Agent:
         return None
 
     def _unsound(self, motion: Motion, now: Instant) -> str | None:
+        if motion.revision > self.programme.newest.revision + REVISION_JUMP_MAX:
+            return f"its revision {motion.revision} is more than {REVISION_JUMP_MAX} ahead"
         if set(motion.slots) != set(self.programme.newest.slots):
             return "its vehicles are not this fleet's"
         if abs(motion.start_ns - now.fleet_ns) > 3_600_000_000_000:
@@ -356,8 +374,13 @@ class Agent:
         breach = first_breach(motion, self.config.geofence)
         if breach is not None and not only_stops(motion, self.programme.newest):
             return f"it leads outside the fence, {breach.sentence()}"
-        if motion.shape == "pads":
-            same = motion.slots == self.config.first_motion.slots
+        if motion.then == "stay" and abs(motion.climb_at_end_m_s) > LEVEL_M_S:
+            return "it climbs or sinks for ever; give an altitude to go to"
+        away_m = self._away_m(motion, now)
+        if not away_m <= self.config.peers.range_m:
+            return f"it begins out of range, {away_m:.0f} m from where this vehicle is to be"
+        if motion.shape == PADS:
+            same = over_the_pads(motion, self.config.first_motion)
             return None if same else "its pads are not this vehicle's; do the configurations differ?"
         try:
             slots = self.config.slots(motion.shape)
@@ -367,18 +390,22 @@ class Agent:
             return "its slots are not what this vehicle assigns; do the configurations differ?"
         return None
 
+    def _away_m(self, motion: Motion, now: Instant) -> float:
+        """How far the own slot jumps when a motion begins (m); a vehicle that does not fly jumps nowhere."""
+        if self.phase not in FILTERED_PHASES:
+            return 0.0
+        at_ns = max(motion.start_ns, now.fleet_ns)
+        ours = self.programme.reference(self.id, at_ns).position_ned_m
+        return dist(motion.reference(self.id, at_ns).position_ned_m, ours)
+
     def _adopt(self, motion: Motion, now: Instant) -> None:
-        blend = motion.blend_start_ns
-        changed = blend != self.programme.newest.blend_start_ns
         if not self.programme.adopt(motion):
             return
         self._plan_payload = encode_motion(motion)
         self.peers.plan_changed()
         if self._sent is not None:
             self._sent = (self._sent[0], self._reference_of(self._sent[0]))
-        if changed:
-            self._settled_since_ns = None
-            self._happened(PhaseEvent.UNSETTLED, now)
+        self.flight.return_wanted = self.flight.return_wanted and not motion.returns
         self._plan_due_ns = now.monotonic_ns if motion.issuer == self.id else None
         self._mention(now)
         self._outputs.notes.append(adoption_note(motion))
@@ -388,7 +415,7 @@ class Agent:
         ours = self.programme.newest.order
         if theirs < ours and self._plan_due_ns is None:
             self._tell_plan_soon(now)
-        self._behind = theirs > ours
+        self.flight.behind = theirs > ours
 
     def _tell_plan_soon(self, now: Instant) -> None:
         self._plan_due_ns = now.monotonic_ns + self._random.randrange(self._spread_ns)
@@ -401,9 +428,17 @@ class Agent:
         once, each checked by all, stop a crowd on one machine for a second.
         """
         newest = self.programme.newest
-        forms = newest.revision == 0 and self.phase is Phase.FORMING and self._all_up()
-        flies = newest.revision == 1 and self.phase is Phase.FORMED and not newest.legs and self._all_formed()
-        if not self.config.plan.automatic or not (forms or flies):
+        automatic, flight = self.config.plan.automatic, self.flight
+        up = flight.forms_without or self._all_up()
+        forms = automatic and newest.revision == 0 and self.phase is Phase.WAITING and up
+        flies = automatic and newest.revision == 1 and self._all_formed() and not newest.legs
+        returns = flight.return_wanted or (
+            newest.then == "return"
+            and newest.end_ns is not None
+            and self.phase in SETTLED_PHASES
+            and now.fleet_ns >= newest.end_ns - PROPOSAL_DELAY_NS
+        )
+        if not (forms or flies or returns) or self.phase not in FILTERED_PHASES:
             self._propose_ns = None
             return
         if self._propose_ns is None:
@@ -411,7 +446,9 @@ class Agent:
         if now.monotonic_ns < self._propose_ns:
             return
         start_ns = now.fleet_ns + PROPOSAL_DELAY_NS
-        if forms:
+        if returns:
+            self._adopt(self._return_motion(max(start_ns, newest.start_ns + 1)), now)
+        elif forms:
             self._adopt(self._formation_motion(self.config.formation.shape, start_ns), now)
         elif legs := self.config.plan_legs(newest.moment(start_ns).centre.position):
             then = self.config.plan.then
@@ -421,11 +458,19 @@ class Agent:
         """Every peer is in the air and steered."""
         return all(phase in FILTERED_PHASES for phase in self.peers.phases().values())
 
+    def _return_motion(self, start_ns: int) -> Motion:
+        return with_return(
+            self.programme.newest, self.config.first_motion, at_ns=start_ns, issuer=self.id,
+            speed_m_s=self.config.return_speed_m_s,
+        )  # fmt: skip
+
     def _all_formed(self) -> bool:
-        """Every peer that is there has formed under the newest motion."""
+        """This vehicle has formed, and every peer that flies with it, under the newest motion; or it waited long."""
+        if self.phase is not Phase.FORMED:
+            return False
         for i, phase in self.peers.phases().items():
             sample = self.peers.sample(i)
-            if phase is None:
+            if phase is None or phase in OUT_OF_FORMATION:
                 continue
             if phase is not Phase.FORMED or sample is None or sample.revision != self.programme.newest.revision:
                 return False
@@ -460,7 +505,8 @@ class Agent:
         if self._plan_due_ns is not None and now.monotonic_ns >= self._plan_due_ns:
             self._plan_due_ns = None
             out.peers.append(("plan", self._plan_payload))
-        out.notes += self.autopilot.notes
+        out.notes = [*self.flight.notes, *out.notes, *self.autopilot.notes]
+        self.flight.notes.clear()
         self.autopilot.notes.clear()
         self._outputs = Outputs()
         return out
@@ -469,8 +515,18 @@ class Agent:
         came, self._position_came = self._position_came, False
         self._last_tick = now
         dt_s = 0.0 if since_ns is None else since_ns * 1e-9
-        measured = self.autopilot.state(now)
-        self._watch(now, measured is not None)
+        if dt_s > LATE_S and self.flight.steers:
+            self.rejected[Failsafe.LOOP_LATE.value] += 1
+        measured = None if self.flight.positions.frozen else self.autopilot.state(now)
+        self.flight.watch(now, measured is not None)
+        if self.phase is not self._announced:
+            both = {self.phase, self._announced}
+            if not both <= FORMATION_PHASES:
+                self._announce(now)
+            elif not both <= SETTLED_PHASES:
+                # Who moves and who rests follows from the plan, which all have.
+                self._mention(now)
+            self._announced = self.phase
         if measured is None:
             if self._resend_ns:
                 # Whoever no longer knows where it is still says so, from the last place it knew.
@@ -481,10 +537,10 @@ class Agent:
         ego, bias = self._observe(measured, gap_s, now)
         motion = self.programme.at(now.fleet_ns)
         moment = motion.moment(now.fleet_ns)
-        reference = moment.slot(motion.slots[self.id])
-        steers = self._steers()
+        reference = self.flight.follow(moment.slot(motion.slots[self.id]), ego, now)
+        steers = self.flight.steers
         if steers or now.monotonic_ns >= self._look_ns:
-            self._neighbours = self.peers.predict(ego.position_ned_m, now, moment, self.phase is Phase.FORMED)
+            self._neighbours = self.peers.predict(ego.position_ned_m, now, moment, self.phase in SETTLED_PHASES)
             self._look_ns = now.monotonic_ns + LOOK_PERIOD_NS
         neighbours = self._neighbours
         residual = ZERO
@@ -496,7 +552,7 @@ class Agent:
                 self._outputs.mavlink.append(self._encode(setpoint))
                 self.setpoints_sent += 1
                 steered = True
-        self._settle(ego, reference, now)
+        self.flight.settle(ego, reference, now)
         self._propose(now)
         self._tell(now, residual, reference)
         self._tick = self._outputs.tick = Tick(
@@ -511,17 +567,13 @@ class Agent:
             ego.velocity_ned_m_s,
         )
 
-    def _steers(self) -> bool:
-        """Whether setpoints are streamed: in formation, before it to be let into OFFBOARD, and until landing begins."""
-        return (
-            self.phase in FILTERED_PHASES
-            or (self.phase is Phase.CLIMBING and self._mode_asked_ns > 0)
-            or (self.phase is Phase.LANDING and not self._land_seen and self.autopilot.custom_mode == Px4Mode.OFFBOARD)
-        )
-
     def _observe(self, measured: tuple[Ned, Ned], dt_s: float, now: Instant) -> tuple[VehicleState, Ned]:
         """The own state without the estimator's velocity bias, and that bias; the filter for sending goes along."""
         position, velocity = measured
+        if self.flight.positions.jumps != self._jumps:
+            self._jumps = self.flight.positions.jumps
+            self._bias = (BiasObserver(), BiasObserver(), BiasObserver())
+            self._filter = (SendFilter(), SendFilter(), SendFilter())
         free = Ned(*(o.step(p, v, dt_s) for o, p, v in zip(self._bias, position, velocity, strict=True)))
         flown = (*self.safety.acceleration_m_s2, 0.0) if self.phase in FILTERED_PHASES else (0.0, 0.0, 0.0)
         for f, p, v, u in zip(self._filter, position, free, flown, strict=True):
@@ -541,7 +593,7 @@ class Agent:
         for n in neighbours:
             q, w, d = n.position_ned_m, n.velocity_ned_m_s, n.offset_ned_m
             dx, dy, dz = p.north - q.north, p.east - q.east, p.down - q.down
-            if n.in_formation:
+            if n.in_formation and not self.flight.alone:
                 s = n.reference_velocity_ned_m_s
                 dvx, dvy = v.north - w.north - (rv.north - s.north), v.east - w.east - (rv.east - s.east)
                 shares.append(pair(dx, dy, dz, dvx, dvy, 0.0, d.north, d.east, dz, g))
@@ -572,176 +624,6 @@ class Agent:
             s.yaw_rad,
         )
 
-    # -- phases ------------------------------------------------------------------------------------------------------
-
-    def _happened(self, event: PhaseEvent, now: Instant) -> None:
-        before, after = self.phase, next_phase(self.phase, event)
-        if after is before:
-            return
-        self._outputs.notes.append(f"{self.phase.name.lower()} -> {after.name.lower()}: {event.value}")
-        self.phase = after
-        self._phase_since_ns = now.monotonic_ns
-        if after is Phase.ARMED:
-            self._mode_before = self.autopilot.custom_mode
-        elif before is not Phase.ARMED:
-            self._mode_before = None
-        self._settled_since_ns = None
-        self._mode_asked_ns = 0
-        # A retry of what has happened would happen again: over the pilot's head, at worst.
-        self.autopilot.withdraw("arming", "take-off", Px4Mode.OFFBOARD.name)
-        if after is Phase.FORMING and event is PhaseEvent.ENGAGED:
-            self.safety.reset()
-            self._formation_since_ns = now.fleet_ns
-        if after is Phase.LANDING:
-            self._land_seen = False
-        if after is Phase.RELEASED:
-            self.autopilot.cancel()
-            if self.autopilot.custom_mode != Px4Mode.OFFBOARD:
-                self._failsafe(f"autopilot left our control: {mode_name(self.autopilot.custom_mode)}")
-        if event in (PhaseEvent.SETTLED, PhaseEvent.UNSETTLED):
-            self._mention(now)
-        else:
-            self._announce(now)
-
-    def _failsafe(self, reason: str) -> None:
-        self.failsafes.append(reason)
-        self._outputs.notes.append(f"failsafe: {reason}")
-
-    def _watch(self, now: Instant, positioned: bool) -> None:
-        """Lead the autopilot through the flight, and notice when it does something else."""
-        ap = self.autopilot
-        match self.phase:
-            case Phase.IDLE:
-                if self._take_off_wanted:
-                    if ap.armed:
-                        self._happened(PhaseEvent.ARMED, now)
-                    elif now.monotonic_ns - self._take_off_since_ns > TAKE_OFF_LIMIT_NS:
-                        self._take_off_wanted = False
-                        ap.withdraw("arming")
-                        self._failsafe("autopilot does not arm: take-off given up")
-                    elif ap.custom_mode == Px4Mode.OFFBOARD:
-                        # Left over from a flight before; without setpoints PX4 does not arm in it.
-                        ap.set_mode(Px4Mode.AUTO_LOITER)
-                    else:
-                        ap.ask("arming", *wire.arm_parameters(True))
-            case Phase.ARMED:
-                self._take_off_wanted = False
-                if not ap.armed:
-                    self._happened(PhaseEvent.DISARMED, now)
-                elif ap.custom_mode == Px4Mode.AUTO_TAKEOFF:
-                    self._happened(PhaseEvent.TAKING_OFF, now)
-                elif ap.custom_mode not in OUR_MODES and ap.custom_mode != self._mode_before:
-                    self._happened(PhaseEvent.TAKEN_OVER, now)
-                elif now.monotonic_ns - self._phase_since_ns > TAKE_OFF_LIMIT_NS:
-                    self._failsafe("autopilot does not take off: landing")
-                    self._happened(PhaseEvent.LAND, now)
-                else:
-                    altitude = self.config.origin.altitude_amsl_m + self.config.formation.altitude_m
-                    if self.config.fleet.frame == "local":
-                        altitude = float("nan")
-                    ap.ask("take-off", *wire.takeoff_parameters(altitude))
-            case Phase.CLIMBING:
-                self._watch_climb(now)
-            case Phase.FORMING | Phase.FORMED:
-                self._watch_flight(now, positioned)
-            case Phase.LANDING:
-                self._watch_landing(now)
-            case Phase.RELEASED:
-                if not ap.armed:
-                    self._happened(PhaseEvent.DISARMED, now)
-            case Phase.LANDED:
-                pass
-
-    def _watch_climb(self, now: Instant) -> None:
-        ap = self.autopilot
-        if not ap.armed:
-            self._happened(PhaseEvent.DISARMED, now)
-            return
-        if ap.custom_mode == Px4Mode.OFFBOARD:
-            self._happened(PhaseEvent.ENGAGED, now)
-            return
-        if ap.custom_mode not in (Px4Mode.AUTO_TAKEOFF, Px4Mode.AUTO_LOITER):
-            self._happened(PhaseEvent.TAKEN_OVER, now)
-            return
-        height = self.config.formation.altitude_m
-        low = self.config.fleet.frame == "global" and -ap.position_ned_m.down < height - HOLD_MARGIN_M
-        if ap.custom_mode == Px4Mode.AUTO_LOITER and low and not self._mode_asked_ns:
-            self._happened(PhaseEvent.TAKEN_OVER, now)
-            return
-        reached = -ap.position_ned_m.down > height - ALTITUDE_TOLERANCE_M
-        if self._mode_asked_ns or reached or ap.custom_mode == Px4Mode.AUTO_LOITER:
-            if not self._mode_asked_ns:
-                self._mode_asked_ns = now.monotonic_ns
-                self.safety.reset()
-            elif now.monotonic_ns - self._mode_asked_ns > 200_000_000:
-                ap.set_mode(Px4Mode.OFFBOARD)
-        if now.monotonic_ns - self._phase_since_ns > CLIMB_LIMIT_NS:
-            self._failsafe("altitude not reached in time: landing")
-            self._happened(PhaseEvent.LAND, now)
-
-    def _watch_flight(self, now: Instant, positioned: bool) -> None:
-        ap = self.autopilot
-        if not ap.armed:
-            self._happened(PhaseEvent.DISARMED, now)
-            return
-        if ap.custom_mode != Px4Mode.OFFBOARD:
-            self._happened(PhaseEvent.TAKEN_OVER, now)
-            return
-        if not positioned and not self._position_stale:
-            # No failsafe of ours: positions may come again before the autopilot's own acts, and if it acts, it leaves
-            # OFFBOARD, which is one.
-            self.rejected["own position stale"] += 1
-            self._outputs.notes.append("own position stale: no setpoints")
-        self._position_stale = not positioned
-        if not positioned:
-            if self.autopilot.position_age_s(now) > POSITION_LOST_S:
-                # By now the autopilot's own failsafe has the vehicle, whether or not we can hear it.
-                self._failsafe("own position lost: the vehicle is left to its autopilot")
-                self._happened(PhaseEvent.TAKEN_OVER, now)
-            return
-        motion = self.programme.at(now.fleet_ns)
-        if motion.then == "land" and motion.end_ns is not None and now.fleet_ns >= motion.end_ns:
-            self._happened(PhaseEvent.LAND, now)
-            return
-        waiting_s = (now.monotonic_ns - self._phase_since_ns) * 1e-9
-        if self.programme.newest.revision == 0 and self.config.plan.automatic and waiting_s > self.config.peers.wait_s:
-            self._failsafe("waited for the others in vain: landing")
-            self._happened(PhaseEvent.LAND, now)
-            return
-        silent_s = self.peers.silent_for_s(now)
-        if silent_s is not None and silent_s > self.config.peers.isolated_flight_s:
-            self._failsafe("all peers lost: landing")
-            self._happened(PhaseEvent.LAND, now)
-
-    def _watch_landing(self, now: Instant) -> None:
-        ap = self.autopilot
-        if not ap.armed:
-            self._happened(PhaseEvent.DISARMED, now)
-        elif ap.custom_mode == Px4Mode.AUTO_LAND:
-            self._land_seen = True
-        elif self._land_seen:
-            # On disarming PX4 falls back to the mode before, which the heartbeat tells a second later.
-            if ap.custom_mode not in (Px4Mode.OFFBOARD, self._mode_before):
-                self._happened(PhaseEvent.TAKEN_OVER, now)
-        elif ap.custom_mode not in OUR_MODES and ap.custom_mode != self._mode_before:
-            self._happened(PhaseEvent.TAKEN_OVER, now)
-        else:
-            ap.set_mode(Px4Mode.AUTO_LAND)
-
-    def _settle(self, ego: VehicleState, reference: Reference, now: Instant) -> None:
-        motion = self.programme.at(now.fleet_ns)
-        on_its_way = motion is not self.programme.newest or now.fleet_ns < motion.blend_end_ns
-        if self.phase is not Phase.FORMING or motion.shape == "pads" or on_its_way:
-            return
-        p, r = ego.position_ned_m, reference.position_ned_m
-        near = hypot(p.north - r.north, p.east - r.east) < SETTLED_TOLERANCE_M and abs(p.down - r.down) < 1.0
-        if not near:
-            self._settled_since_ns = None
-        elif self._settled_since_ns is None:
-            self._settled_since_ns = now.monotonic_ns
-        elif now.monotonic_ns - self._settled_since_ns >= SETTLED_FOR_NS:
-            self._happened(PhaseEvent.SETTLED, now)
-
     # -- telling the peers -------------------------------------------------------------------------------------------
 
     def _announce(self, now: Instant) -> None:
@@ -764,7 +646,7 @@ class Agent:
         due = bool(self._resend_ns) and now.monotonic_ns >= self._resend_ns[0]
         if due:
             self._resend_ns = [t for t in self._resend_ns if t > now.monotonic_ns]
-        if self._behind and since_s >= CATCH_UP_NS * 1e-9:
+        if self.flight.behind and since_s >= CATCH_UP_NS * 1e-9:
             due = True
         filtered = tuple(f.position_m or 0.0 for f in self._filter), tuple(f.velocity_m_s for f in self._filter)
         position, velocity = Ned(*filtered[0]), Ned(*filtered[1])
@@ -796,7 +678,8 @@ class Agent:
             case "error":
                 return exceeds(error_p, error_v, residual.north**2 + residual.east**2, self._error_trigger)
             case "switching":
-                start = now.fleet_ns if self._formation_since_ns is None else self._formation_since_ns
+                since_ns = self.flight.formation_since_ns
+                start = now.fleet_ns if since_ns is None else since_ns
                 return switching_exceeds(error_p, error_v, (now.fleet_ns - start) * 1e-9, self._switching_trigger)
             case "periodic":
                 return since_s >= self.config.trigger.period_s - 1e-3
@@ -816,6 +699,7 @@ class Agent:
             "ready": [c.says for c in unready],
             "unfit": [c.says for c in unready if c.lasting],
             "revision": self.programme.newest.revision,
+            "command": [self.orders.revision, self.orders.issuer],
             "shape": self.programme.newest.shape,
             "moving": self.programme.newest.end_ns is None or bool(self.programme.newest.legs),
             "position_error_m": tick.position_error_m if tick else None,
@@ -826,8 +710,10 @@ class Agent:
             "setpoints": self.setpoints_sent,
             "battery_percent": self.autopilot.battery_percent,
             "configuration": self.config.shared_hash,
-            "failsafes": list(self.failsafes),
-            "rejected": dict(self.rejected + self.peers.rejected + self.link.rejected + self.autopilot.counts),
+            "failsafes": list(self.flight.failsafes),
+            "rejected": dict(
+                self.rejected + self.flight.counts + self.peers.rejected + self.link.rejected + self.autopilot.counts
+            ),
             "limited": dict(self.safety.counts),
             "motion": json.loads(encode_motion(self.programme.newest)),
         }

@@ -11,7 +11,14 @@ from math import inf
 
 from companion.core.frames import Geodetic, LocalFrame, Ned
 from companion.core.values import ZERO, Instant
-from companion.preflight import PARAMETERS, POSITION_LIMIT_S, AutopilotFacts
+from companion.preflight import (
+    ESTIMATOR_FLAGS_NEEDED,
+    ESTIMATOR_GLOBAL_FLAG,
+    ESTIMATOR_RELATIVE_FLAG,
+    PARAMETERS,
+    POSITION_LIMIT_S,
+    AutopilotFacts,
+)
 from companion.wire import mavlink as wire
 from companion.wire.mavlink import MavlinkLink, Px4Mode
 
@@ -135,6 +142,8 @@ class AutopilotClient:
         self.fleet_origin = fleet_origin
         self.armed = False
         self.custom_mode = 0
+        self.intended_mode: int | None = None
+        """what the user chose, as CURRENT_MODE tells: another than custom_mode means a failsafe of the autopilot's"""
         self.autopilot_kind = -1
         self.vehicle_type = -1
         self.landed_state = 0
@@ -167,6 +176,7 @@ class AutopilotClient:
         """when what is not answered yet was asked"""
         self._round_trip_heard_ns = 0
         self._clock_ahead_ns: deque[int] = deque(maxlen=CLOCK_SAMPLES)
+        self._origin_doubted = False
 
     def receive(self, datagram: bytes, now: Instant) -> bool:
         """Take a datagram; True if it brought a position."""
@@ -182,6 +192,7 @@ class AutopilotClient:
                     self._heartbeat(event, now)
                 case wire.CurrentMode():
                     self.custom_mode = event.custom_mode
+                    self.intended_mode = event.intended_custom_mode
                 case wire.LandedState():
                     self.landed_state = event.state
                 case wire.GlobalOrigin():
@@ -248,7 +259,12 @@ class AutopilotClient:
         self.velocity_ned_m_s = event.velocity_ned_m_s
         return True
 
+    def doubt_origin(self) -> None:
+        """Ask for the estimator's origin again, since a position jumped."""
+        self._origin_doubted = True
+
     def _origin(self, origin: Geodetic) -> None:
+        self._origin_doubted = False
         if self.fleet_origin is None or origin == self.origin:
             return
         if self.origin is not None:
@@ -324,7 +340,7 @@ class AutopilotClient:
             self._next_heartbeat_ns = now.monotonic_ns + 1_000_000_000
         if self.heartbeat_ns is None:
             return out
-        if self.origin is None and self.fleet_origin is not None and now.monotonic_ns >= self._next_origin_ns:
+        if self._asks_origin and now.monotonic_ns >= self._next_origin_ns:
             self._next_origin_ns = now.monotonic_ns + 1_000_000_000
             out.append(self.link.command(*wire.request_message_parameters(wire.ORIGIN_MESSAGE_ID)))
         for queue in self._queues.values():
@@ -354,19 +370,30 @@ class AutopilotClient:
         """When `due` next has something to say (monotonic ns)."""
         times = [self._next_heartbeat_ns]
         times += [queue[0].next_ns for queue in self._queues.values() if queue]
-        if self.heartbeat_ns is not None and self.origin is None and self.fleet_origin is not None:
+        if self.heartbeat_ns is not None and self._asks_origin:
             times.append(self._next_origin_ns)
         if self.heartbeat_ns is not None and not self.armed:
             times += [self._round_trip_asked_ns + ROUND_TRIP_PERIOD_NS, self.parameters.next_deadline_ns()]
         return min(times)
+
+    @property
+    def _asks_origin(self) -> bool:
+        return self.fleet_origin is not None and (self.origin is None or self._origin_doubted)
+
+    @property
+    def flags_needed(self) -> int:
+        """ESTIMATOR_STATUS flags without which nobody flies in this frame."""
+        return ESTIMATOR_FLAGS_NEEDED | (
+            ESTIMATOR_GLOBAL_FLAG if self.fleet_origin is not None else ESTIMATOR_RELATIVE_FLAG
+        )
 
     def position_age_s(self, now: Instant) -> float:
         """Age of the latest position (s); infinite before the first."""
         return inf if self.position_ns is None else (now.monotonic_ns - self.position_ns) * 1e-9
 
     def state(self, now: Instant) -> tuple[Ned, Ned] | None:
-        """Position and velocity now (fleet frame), the latest carried on by its age; None when stale."""
-        if self.position_ns is None:
+        """Position and velocity now (fleet frame), the latest carried on by its age; None if stale or without frame."""
+        if self.position_ns is None or self.frame is None:
             return None
         age_s = (now.monotonic_ns - self.position_ns) * 1e-9
         if age_s > POSITION_LIMIT_S:

@@ -28,10 +28,12 @@ from companion.core.law import Gains, paper_gains
 from companion.core.monitor import prediction_error_bound_m
 from companion.core.neighbours import PeerLimits
 from companion.core.plan import (
+    PADS,
     GotoLeg,
     Leg,
     Motion,
     SlotChange,
+    Then,
     TurnLeg,
     VelocityLeg,
     goto_duration_s,
@@ -49,6 +51,7 @@ Positive = Annotated[float, Field(gt=0, le=1e5, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, le=1e5, allow_inf_nan=False)]
 Gain = Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+Percent = Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)]
 VehicleId = Annotated[int, Field(ge=1, le=250)]
 
 PLAN_SPEED_SHARE = 0.75
@@ -136,7 +139,8 @@ class PlanTable(_Table):
     legs: tuple[LegTable, ...] = ()
     heading: Literal["fixed", "track"] = "fixed"
     """track: the formation's heading follows turns"""
-    then: Literal["stay", "land"] = "stay"
+    then: Then = "stay"
+    """return: back over the pads, and land there"""
     automatic: bool = True
     """the fleet forms and starts the plan by itself; false: it waits for the operator's commands"""
 
@@ -215,7 +219,9 @@ class PeersTable(_Table):
     digest: Annotated[int, Field(ge=0, le=30)] = 3
     """how many peers' latest samples a message carries"""
     wait_s: Positive = 60.0
-    """how long a vehicle in the air waits for the others before it lands"""
+    """how long a vehicle in the air waits for the others"""
+    missing: Literal["land", "continue"] = "land"
+    """what it does then: land, or form with those that are up"""
     isolated_flight_s: Positive = 5.0
     """how long a vehicle that hears nobody flies on before it holds"""
     network: Literal["laptop", "field"] = "laptop"
@@ -247,6 +253,18 @@ class PreflightTable(_Table):
     """the autopilot's COM_OF_LOSS_T"""
     require_rc: bool = False
     """whether every vehicle has a pilot with a transmitter"""
+
+
+class FailsafeTable(_Table):
+    """Limits of failsafes; the others are constants (`core.failsafe`)."""
+
+    battery_low_percent: Percent = 25.0
+    battery_low: Literal["return", "land", "continue"] = "return"
+    """return: the whole fleet flies back over its pads and lands there"""
+    battery_critical_percent: Percent = 12.0
+    """land at once; 0 never"""
+    isolated_hold_s: Positive = 10.0
+    """how long a vehicle that hears nobody stands before it lands"""
 
 
 class LaunchTable(_Table):
@@ -311,6 +329,7 @@ class FleetConfig(_Table):
     fence: FenceTable | None = None
     peers: PeersTable = PeersTable()
     preflight: PreflightTable = PreflightTable()
+    failsafe: FailsafeTable = FailsafeTable()
     launch: LaunchTable = LaunchTable()
     stub: StubTable = StubTable()
     vehicle: Annotated[tuple[VehicleTable, ...], Field(min_length=1, max_length=250)]
@@ -409,6 +428,12 @@ class FleetConfig(_Table):
         return max(self.r0_m, barrier) + SPACING_MARGIN_M
 
     @property
+    def return_speed_m_s(self) -> float:
+        """How fast the centre flies back over the pads, and the slots about it (m/s): both together within the plan's
+        share of the limit."""
+        return PLAN_SPEED_SHARE * self.limits.speed_max_m_s / 2
+
+    @property
     def peer_limits(self) -> PeerLimits:
         return PeerLimits(
             hold=self.law.hold,
@@ -492,7 +517,7 @@ class FleetConfig(_Table):
             revision=0,
             start_ns=0,
             issuer=0,
-            shape="pads",
+            shape=PADS,
             slots={v.id: SlotChange(s, s) for v, s in zip(self.vehicles, level, strict=True)},
             blend_start_ns=0,
             blend_s=0.0,
@@ -691,6 +716,14 @@ def _plan_faults(config: FleetConfig) -> Iterator[str]:
                         f"got {leg.speed_m_s:g}"
                     )
                 altitude_m = altitude_m if leg.altitude_m is None else leg.altitude_m
+    last = config.plan.legs[-1] if config.plan.legs else None
+    if isinstance(last, VelocityLegTable) and last.up_m_s != 0.0 and config.plan.then == "stay":
+        yield f"$.plan.legs[{len(config.plan.legs) - 1}].up_m_s must be 0 m/s in the last leg: it goes on for ever"
+    if config.failsafe.battery_critical_percent > config.failsafe.battery_low_percent:
+        yield (
+            "$.failsafe.battery_critical_percent must be <= $.failsafe.battery_low_percent = "
+            f"{config.failsafe.battery_low_percent:g}, got {config.failsafe.battery_critical_percent:g}"
+        )
 
 
 def _fence_faults(fence: FenceTable) -> Iterator[str]:

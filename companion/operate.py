@@ -5,6 +5,7 @@ decides for itself whether it takes it.
 """
 
 import json
+import secrets
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from math import pi, radians
@@ -14,7 +15,17 @@ from pydantic import ValidationError
 
 from companion.config import FleetConfig
 from companion.core.frames import Ned
-from companion.core.plan import GotoLeg, Leg, Motion, TurnLeg, VelocityLeg, goto_duration_s, with_formation, with_legs
+from companion.core.plan import (
+    GotoLeg,
+    Leg,
+    Motion,
+    TurnLeg,
+    VelocityLeg,
+    goto_duration_s,
+    with_formation,
+    with_legs,
+    with_return,
+)
 from companion.core.values import ZERO
 from companion.errors import RefusedError, WireError
 from companion.preflight import Account, ClockReading
@@ -25,6 +36,7 @@ COMMAND_LEAD_NS = 2_000_000_000
 """how far ahead of now a commanded motion starts, so that every vehicle has it by then"""
 ANSWER_TIMEOUT_S = 5.0
 STATUS_TIMEOUT_S = 1.0
+KILL_STATUS_TIMEOUT_S = 0.6
 RETRY_S = 0.5
 PREFLIGHT_TIMEOUT_S = 3.0
 CLOCK_ROUNDS_LEAST, CLOCK_ROUNDS_MOST = 3, 10
@@ -78,22 +90,30 @@ class Answers:
 
 
 class Operator:
-    """Commands to a running fleet."""
+    """Commands to a running fleet, each newer than what any vehicle has obeyed."""
 
-    def __init__(self, config: FleetConfig, link: Link) -> None:
+    def __init__(self, config: FleetConfig, link: Link, issuer: str | None = None) -> None:
         self.config = config
         self.link = link
         self.ids = tuple(v.id for v in config.vehicles)
+        self.issuer = f"operator-{secrets.token_hex(4)}" if issuer is None else issuer
+        self._revision = 0
+        """of the newest command that was seen or given"""
 
     def status(self, timeout_s: float = STATUS_TIMEOUT_S) -> dict[int, dict[str, Any] | None]:
         """Each vehicle's own account of itself; None from the silent."""
-        return {i: _object(a) for i, a in self.link.ask(self.ids, "status", b"", timeout_s, RETRY_S).items()}
+        told = {i: _object(a) for i, a in self.link.ask(self.ids, "status", b"", timeout_s, RETRY_S).items()}
+        self._revision = max([self._revision, *(_command_revision(s) for s in told.values() if s is not None)])
+        return told
 
-    def command(self, verb: str, **more: object) -> Answers:
-        """A verb to every vehicle, asked again until each has answered or the time is over."""
-        payload = json.dumps({"verb": verb, **more}).encode()
+    def command(self, verb: str, vehicle: int | None = None, **more: object) -> Answers:
+        """A verb to every vehicle or to one, asked again until each has answered or the time is over."""
+        ids = self.ids if vehicle is None else (self.config.by_id(vehicle).id,)
+        self._revision += 1
+        order = {"verb": verb, "revision": self._revision, "issuer": self.issuer, **more}
+        payload = json.dumps(order).encode()
         accepted, refused, silent = [], {}, []
-        for i, answer in self.link.ask(self.ids, "command", payload, ANSWER_TIMEOUT_S, RETRY_S).items():
+        for i, answer in self.link.ask(ids, "command", payload, ANSWER_TIMEOUT_S, RETRY_S).items():
             said = _object(answer)
             if said is None:
                 silent.append(i)
@@ -108,6 +128,7 @@ class Operator:
         report = self.preflight()
         if not report.fit:
             raise PreflightError(report)
+        self.status()
         return self.command("takeoff")
 
     def preflight(self) -> Report:
@@ -129,9 +150,34 @@ class Operator:
         offsets = {i: best_offset(r) for i, r in readings.items()}
         return fleet_report(self.config, accounts, offsets, {i: frozenset(b) for i, b in boots.items()})
 
-    def land(self) -> Answers:
-        """Every vehicle lands where it is."""
-        return self.command("land")
+    def land(self, vehicle: int | None = None) -> Answers:
+        """Every vehicle, or one, lands where it is."""
+        self.status()
+        return self.command("land", vehicle)
+
+    def release(self, vehicle: int | None = None) -> Answers:
+        """Every vehicle, or one, is the pilot's: no setpoint any more, its autopilot in hold mode."""
+        self.status()
+        return self.command("release", vehicle)
+
+    def resume(self, vehicle: int | None = None) -> Answers:
+        """Companions steer again whoever was released, or was found in the air at their start."""
+        self.status()
+        return self.command("resume", vehicle)
+
+    def kill(self, vehicle: int | None = None) -> Answers:
+        """Motors stop at once, in the air too. Whoever calls this has asked a person whether it is meant."""
+        self.status(KILL_STATUS_TIMEOUT_S)
+        return self.command("kill", vehicle, confirm=True)
+
+    def rtl(self, now_ns: int) -> Answers:
+        """Back over the pads, each vehicle over its own, and land there; RefusedError before the fleet has formed."""
+        newest = self._formed()
+        motion = with_return(
+            newest, self.config.first_motion, at_ns=self._start_ns(newest, now_ns), issuer=0,
+            speed_m_s=self.config.return_speed_m_s,
+        )  # fmt: skip
+        return self._send(motion)
 
     def form(self, shape: str, now_ns: int) -> Answers:
         """Another formation; RefusedError if nobody says where the fleet is, ConfigError for an unknown shape."""
@@ -148,7 +194,10 @@ class Operator:
     def move(self, leg: Leg, now_ns: int) -> Answers:
         """Another motion of the formation; RefusedError before it has formed by itself."""
         newest = self._formed()
-        return self._send(with_legs(newest, at_ns=self._start_ns(newest, now_ns), issuer=0, legs=(leg,)))
+        motion = with_legs(newest, at_ns=self._start_ns(newest, now_ns), issuer=0, legs=(leg,))
+        if abs(motion.climb_at_end_m_s) > 1e-6:
+            raise RefusedError("the formation would climb or sink for ever: give it a place and an altitude to go to")
+        return self._send(motion)
 
     def goto(self, north_m: float, east_m: float, altitude_m: float | None, speed_m_s: float, now_ns: int) -> Answers:
         """Fly the formation's centre to a point of the fleet frame and stop there."""
@@ -214,6 +263,12 @@ def _object(answer: bytes | None) -> dict[str, Any] | None:
     except (ValueError, RecursionError):
         return None
     return said if isinstance(said, dict) else None
+
+
+def _command_revision(status: Mapping[str, Any]) -> int:
+    """Revision of the last command that a vehicle obeyed, as it tells; 0 from whoever tells none."""
+    told = status.get("command")
+    return told[0] if isinstance(told, list) and told and type(told[0]) is int else 0
 
 
 def velocity_leg(north_m_s: float, east_m_s: float, up_m_s: float) -> VelocityLeg:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from companion.agent import Agent
 from companion.config import parse
+from companion.core.failsafe import Failsafe
 from companion.core.values import Instant
 from companion.errors import CompanionError
 from companion.io.recorder import Entry, read_recording
@@ -124,6 +125,11 @@ def _stop(agent: Agent, _: bytes, now: Instant) -> Iterator[tuple[str, bytes]]:
     return iter(())
 
 
+def _notice(agent: Agent, body: bytes, now: Instant) -> Iterator[tuple[str, bytes]]:
+    agent.notice(Failsafe[body.decode()], now)
+    return iter(())
+
+
 INPUTS = {
     "advance": _advance,
     "input/mavlink": _mavlink,
@@ -131,4 +137,5 @@ INPUTS = {
     "input/presence": _presence,
     "input/command": _command,
     "input/stop": _stop,
+    "input/notice": _notice,
 }

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from companion.config import read_tables
-from companion.errors import CompanionError, ConfigError
+from companion.errors import CompanionError, ConfigError, RefusedError
 
 app = typer.Typer(
     no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
@@ -23,6 +23,7 @@ USAGE_ERROR = 2
 
 FleetFile = Annotated[Path, typer.Option("--fleet", help="The fleet's configuration.")]
 Vehicles = Annotated[int | None, typer.Option(min=1, max=250, help="Fly this many, whatever the file lists.")]
+OneVehicle = Annotated[int | None, typer.Option(min=1, max=250, help="This vehicle's id alone.")]
 Parameters = Annotated[
     list[str] | None, typer.Option(metavar="NAME=VALUE", help="With --autopilot px4: a PX4 parameter, repeatable.")
 ]
@@ -364,9 +365,41 @@ def takeoff(fleet: FleetFile = DEFAULT_FILE, vehicles: Vehicles = None) -> None:
 
 
 @app.command()
-def land(fleet: FleetFile = DEFAULT_FILE, vehicles: Vehicles = None) -> None:
-    """Land every vehicle where it is."""
-    _operate(fleet, vehicles, "land", lambda o: o.land())
+def land(fleet: FleetFile = DEFAULT_FILE, vehicles: Vehicles = None, vehicle: OneVehicle = None) -> None:
+    """Land every vehicle, or one, where it is."""
+    _operate(fleet, vehicles, "land", lambda o: o.land(vehicle))
+
+
+@app.command()
+def rtl(fleet: FleetFile = DEFAULT_FILE, vehicles: Vehicles = None) -> None:
+    """Fly back over the pads, each vehicle over its own, and land there."""
+    _operate(fleet, vehicles, "rtl", lambda o: o.rtl(time.time_ns()))
+
+
+@app.command()
+def release(fleet: FleetFile = DEFAULT_FILE, vehicles: Vehicles = None, vehicle: OneVehicle = None) -> None:
+    """Give every vehicle, or one, to the pilot: its companion sends no setpoint, its autopilot holds."""
+    _operate(fleet, vehicles, "release", lambda o: o.release(vehicle))
+
+
+@app.command()
+def resume(fleet: FleetFile = DEFAULT_FILE, vehicles: Vehicles = None, vehicle: OneVehicle = None) -> None:
+    """Steer again what was released, or was in the air when its companion started: it stands, then comes back."""
+    _operate(fleet, vehicles, "resume", lambda o: o.resume(vehicle))
+
+
+@app.command()
+def kill(
+    fleet: FleetFile = DEFAULT_FILE,
+    vehicles: Vehicles = None,
+    vehicle: OneVehicle = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+) -> None:
+    """Stop the motors of every vehicle, or of one, at once: in the air it falls."""
+    whom = "every vehicle" if vehicle is None else f"vehicle {vehicle}"
+    if not yes and input(f"{whom} falls from the air. Type kill to do it: ").strip() != "kill":
+        raise RefusedError("kill was not confirmed")
+    _operate(fleet, vehicles, "kill", lambda o: o.kill(vehicle))
 
 
 @app.command()

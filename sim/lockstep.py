@@ -4,6 +4,7 @@ They speak the real MAVLink and peer bytes; only sockets and waiting are missing
 """
 
 import heapq
+import json
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from random import Random
@@ -12,6 +13,7 @@ import numpy as np
 
 from companion.agent import Agent, Outputs
 from companion.config import FleetConfig
+from companion.core.failsafe import Failsafe
 from companion.core.frames import Ned
 from companion.core.values import Instant, Phase
 from sim.autopilot import Autopilot
@@ -68,6 +70,9 @@ class Lockstep:
     _autopilot_due_ns: dict[int, int] = field(default_factory=dict)
     _agent_due_ns: dict[int, int] = field(default_factory=dict)
     """deadlines, kept until something reaches the vehicle: asking all at each step would cost most of the time"""
+    _stalled_until_ns: dict[int, int] = field(default_factory=dict)
+    _orders: int = 0
+    """revision of the last command that came without one"""
     _touched: set[int] = field(default_factory=set)
     """vehicles whose deadlines may have changed"""
 
@@ -135,7 +140,7 @@ class Lockstep:
             v = self.vehicles[i]
             self._autopilot_due_ns[i] = v.autopilot.next_deadline_ns()
             if v.alive:
-                self._agent_due_ns[i] = v.agent.next_deadline_ns()
+                self._agent_due_ns[i] = max(v.agent.next_deadline_ns(), self._stalled_until_ns.get(i, 0))
             else:
                 self._agent_due_ns.pop(i, None)
         self._touched.clear()
@@ -197,14 +202,38 @@ class Lockstep:
 
     # -- what a test or a study does with it -------------------------------------------------------------------------
 
-    def command(self, payload: bytes) -> dict[int, bytes]:
-        """An operator's command to every companion that runs; their answers."""
+    def command(self, payload: bytes, *ids: int) -> dict[int, bytes]:
+        """An operator's command to every companion that runs, or to those named; their answers.
+
+        One without a revision is made the next command.
+        """
+        payload = self._in_order(payload)
         answers = {}
         for i, v in self.vehicles.items():
-            if v.alive:
+            if v.alive and (not ids or i in ids):
                 self._log(i, "input/command", payload)
                 answers[i] = v.agent.receive_command(payload, self.now)
         return answers
+
+    def _in_order(self, payload: bytes) -> bytes:
+        try:
+            order = json.loads(payload)
+        except (ValueError, RecursionError):
+            return payload
+        if not isinstance(order, dict) or "revision" in order:
+            return payload
+        self._orders += 1
+        return json.dumps({**order, "revision": self._orders, "issuer": "lockstep"}).encode()
+
+    def stall(self, i: int, seconds: float) -> None:
+        """Keep a companion's loop from running for a while; what arrives meanwhile waits in its agent."""
+        self._stalled_until_ns[i] = self.now_ns + round(seconds * 1e9)
+        self._touched.add(i)
+
+    def notice(self, i: int, failsafe: Failsafe) -> None:
+        """Tell a companion's agent what only its process can see."""
+        self._log(i, "input/notice", failsafe.name.encode())
+        self.vehicles[i].agent.notice(failsafe, self.now)
 
     def kill(self, i: int) -> None:
         """End a companion without a word, as kill -9 does; its autopilot flies on."""

@@ -235,7 +235,11 @@ def _steady(flight: Flight, programme: Programme, times: Array, formed_ns: int |
     if formed_ns is None or not len(times):
         return np.zeros(len(times), bool)
     steady = times >= formed_ns + round(SETTLING_S * 1e9)
-    landing = [t for t, i, text in flight.notes if "-> landing" in text and t > formed_ns and i not in flight.lost]
+    landing = [
+        t
+        for t, i, text in flight.notes
+        if ("-> landing" in text or "-> returning" in text) and t > formed_ns and i not in flight.lost
+    ]
     if landing:
         steady &= times < min(landing)
     for motion in programme.motions[1:]:

@@ -20,6 +20,9 @@ PLAIN_INTERVAL_S = 5.0
 NARROW = 100
 """columns of a terminal below which mode and battery are left out"""
 Vehicles = Mapping[int, Mapping[str, Any] | None]
+PHASE_STYLES = {
+    **dict.fromkeys(("formed", "moving", "holding"), "green"), "apart": "yellow", "released": "red"
+}  # fmt: skip
 
 
 def status_table(
@@ -41,7 +44,7 @@ def status_table(
         if s is None:
             table.add_row(str(i), Text("silent", style="red"))
             continue
-        style = {"formed": "green", "released": "red"}.get(s["phase"], "")
+        style = PHASE_STYLES.get(s["phase"], "")
         table.add_row(
             str(i),
             Text(s["phase"], style=style),

@@ -3,13 +3,24 @@
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from math import dist, isfinite
+from math import dist, hypot, isfinite
 from statistics import median
 
+from companion.core.failsafe import FROZEN_S, SUSPECT_S
 from companion.core.frames import Ned
+from companion.core.health import MOVING_M_S, jumped
 from companion.core.hold import HoldKind, axis, weights
 from companion.core.plan import Moment, Programme, Reference
-from companion.core.values import FILTERED_PHASES, ZERO, Instant, Neighbour, PeerMessage, PeerSample, Phase
+from companion.core.values import (
+    AIRBORNE_PHASES,
+    FORMATION_PHASES,
+    ZERO,
+    Instant,
+    Neighbour,
+    PeerMessage,
+    PeerSample,
+    Phase,
+)
 from companion.core.vectors import between, share_of_segment
 
 FUTURE_LIMIT_S = 1.0
@@ -17,11 +28,22 @@ FUTURE_LIMIT_S = 1.0
 PRESENCE_DELAY_S = 1.5
 """how long after a peer's end its presence may still be reported"""
 VERTICAL_DAMPING_S = 2.0
+FREE_DAMPING_S = 2.0
+"""time in which the velocity of a vehicle fades that follows no plan that we know: the pilot's, or one apart"""
+PEER_ACCELERATION_M_S2 = 8.0
+PEER_SPEED_M_S = 8.0
+"""and no peer is faster than this beyond the velocity that it told"""
+PEER_MARGIN_M = 1.0
+PEER_MARGIN_M_S = 1.0
+"""two samples of a peer further apart than this and PEER_ACCELERATION_M_S2 explain are no motion"""
 GATE_VELOCITY_M_S = 0.7
 GATE_RESIDUAL_M = 2.0
 GATE_PERIOD_NS = 100_000_000
 UNCERTAINTY_GROWTH_M_S = 0.3
 UNCERTAINTY_GROWTH_MAX_M = 1.0
+
+
+_NOWHERE = Reference(ZERO, ZERO, ZERO, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,11 +69,12 @@ def held(
 
     `reference_then` is p_ref and v_d of the sender's slot at the sample's time, `reference` the one at `fleet_ns`. A
     vehicle in formation is held by the configured hold. One that climbs or lands stays over its spot, and its vertical
-    speed fades, since it ends at its altitude or on the ground; any other stands.
+    speed fades, since it ends at its altitude or on the ground; the velocity of one that flies by itself, or under
+    somebody else, fades too. Whoever has landed or waits to be armed stands.
     """
     tau_s = max(0.0, (fleet_ns - sample.time_ns) * 1e-9)
     p, v = sample.position_ned_m, sample.velocity_ned_m_s
-    if sample.phase in FILTERED_PHASES:
+    if sample.phase in FORMATION_PHASES:
         w = weights(limits.hold, tau_s, limits.hold_damping_s)
         then_p, then_v = reference_then
         now_p, now_v = reference.position_ned_m, reference.velocity_ned_m_s
@@ -62,6 +85,11 @@ def held(
     if sample.phase in (Phase.ARMED, Phase.CLIMBING, Phase.LANDING):
         w = weights("damped", tau_s, VERTICAL_DAMPING_S)
         return Ned(p.north, p.east, p.down + w.position * v.down), Ned(0.0, 0.0, w.velocity * v.down)
+    if sample.phase in (Phase.APART, Phase.RELEASED, Phase.IDLE):
+        # IDLE too: a companion that starts in flight does not steer.
+        w = weights("damped", tau_s, FREE_DAMPING_S)
+        k, f = w.position, w.velocity
+        return Ned(p.north + k * v.north, p.east + k * v.east, p.down + k * v.down), Ned(*(f * x for x in v))
     return p, ZERO
 
 
@@ -76,6 +104,10 @@ class _Peer:
     """fleet time at which presence ended or silence became too long"""
     silent: bool = False
     """it is lost by its silence, not by the end of its presence"""
+    suspect_until_ns: int = 0
+    """fleet time until which nothing is built on what it says"""
+    same_since_ns: int = 0
+    """time of the first sample with its present position"""
 
 
 @dataclass(slots=True)
@@ -109,6 +141,8 @@ class PeerTable:
                 if peer.boot_id != message.boot_id or peer.lost_at_ns is None or sample.time_ns > peer.lost_at_ns:
                     # One that was sent before the sender's end, and came late, brings nobody back.
                     peer.present, peer.lost_at_ns, peer.silent = True, None, False
+                if peer.boot_id == message.boot_id:
+                    self._examine(peer, sample, now)
                 peer.boot_id, peer.sequence = message.boot_id, message.sequence
                 self._store(peer, sample)
         if reason is not None:
@@ -133,11 +167,40 @@ class PeerTable:
             return "not finite"
         if (sample.time_ns - now.fleet_ns) * 1e-9 > FUTURE_LIMIT_S:
             return "from the future"
+        if (now.fleet_ns - sample.time_ns) * 1e-9 > self.limits.stale_after_s:
+            return "too old on arrival"
         return None
+
+    def _examine(self, peer: _Peer, sample: PeerSample, now: Instant) -> None:
+        """Suspect a peer whose next sample no motion explains, or that moves without changing its position."""
+        last = peer.sample
+        if last is None or sample.time_ns <= last.time_ns:
+            return
+        steered = AIRBORNE_PHASES - {Phase.RELEASED}
+        if last.phase not in steered or sample.phase not in steered:
+            return
+        lie = None
+        if jumped(
+            (last.position_ned_m, last.velocity_ned_m_s), (sample.position_ned_m, sample.velocity_ned_m_s),
+            (sample.time_ns - last.time_ns) * 1e-9, PEER_ACCELERATION_M_S2, PEER_MARGIN_M, PEER_MARGIN_M_S,
+            PEER_SPEED_M_S,
+        ):  # fmt: skip
+            lie = "a peer's state jumps"
+        elif (
+            sample.position_ned_m == last.position_ned_m
+            and hypot(*sample.velocity_ned_m_s) > MOVING_M_S
+            and sample.time_ns - peer.same_since_ns >= FROZEN_S * 1e9
+        ):
+            lie = "a peer's position frozen"
+        if lie is not None:
+            self.rejected[lie] += 1
+            peer.suspect_until_ns = now.fleet_ns + round(SUSPECT_S * 1e9)
 
     def _store(self, peer: _Peer, sample: PeerSample) -> None:
         if peer.sample is not None and sample.time_ns <= peer.sample.time_ns:
             return
+        if peer.sample is None or sample.position_ned_m != peer.sample.position_ned_m:
+            peer.same_since_ns = sample.time_ns
         peer.sample = sample
         if peer.lost_at_ns is not None and (peer.silent or sample.time_ns > peer.lost_at_ns):
             # By digest: it is alive though it is not heard here.
@@ -153,16 +216,17 @@ class PeerTable:
                 peer.reference_then = (reference.position_ned_m, reference.velocity_ned_m_s)
 
     def presence(self, vehicle_id: int, alive: bool, now: Instant) -> None:
-        """Liveliness of a peer's process came or went."""
+        """Liveliness of a peer's process came or went.
+
+        That a process is there says nothing of where its vehicle is: one that was lost comes back with a sample.
+        """
         peer = self._peers.get(vehicle_id)
         if peer is None:
             if vehicle_id != self.own_id:
                 self.rejected["foreign id"] += 1
             return
         peer.present = alive
-        if alive:
-            peer.lost_at_ns, peer.silent = None, False
-        elif peer.lost_at_ns is None:
+        if not alive and peer.lost_at_ns is None:
             peer.lost_at_ns = now.fleet_ns
 
     def sample(self, vehicle_id: int) -> PeerSample | None:
@@ -237,20 +301,20 @@ class PeerTable:
 
     def _predict(self, peer: _Peer, sample: PeerSample, now: Instant, reference: Reference, own: Ned) -> Neighbour:
         limits = self.limits
-        flying = sample.phase in FILTERED_PHASES
+        follows = sample.phase in FORMATION_PHASES
+        airborne = sample.phase in AIRBORNE_PHASES
         tau_s = max(0.0, (now.fleet_ns - sample.time_ns) * 1e-9)
-        if tau_s > limits.stale_after_s and peer.lost_at_ns is None and flying:
+        if tau_s > limits.stale_after_s and peer.lost_at_ns is None and airborne:
             peer.lost_at_ns, peer.silent = sample.time_ns + round(limits.stale_after_s * 1e9), True
         position, velocity = held(sample, peer.reference_then, reference, now.fleet_ns, limits)
         uncertainty = limits.uncertainty_m
         other_end: Ned | None = None
-        lost = peer.lost_at_ns is not None
-        if flying and peer.lost_at_ns is not None:
+        sound = follows and peer.lost_at_ns is None and now.fleet_ns >= peer.suspect_until_ns
+        if airborne and peer.lost_at_ns is not None:
             since_s = (now.fleet_ns - peer.lost_at_ns) * 1e-9
             uncertainty += min(UNCERTAINTY_GROWTH_M_S * max(since_s, 0.0), UNCERTAINTY_GROWTH_MAX_M)
             position, velocity, other_end = self._both_ends(peer, sample, peer.lost_at_ns, now)
         slot = reference.position_ned_m
-        heard = flying and not lost
         # By place: naming the fields costs as much again, for every peer at every tick.
         return Neighbour(
             sample.vehicle_id,
@@ -258,8 +322,8 @@ class PeerTable:
             velocity,
             Ned(own.north - slot.north, own.east - slot.east, own.down - slot.down),
             tau_s,
-            heard,
-            heard,
+            sound,
+            sound,
             uncertainty,
             other_end,
             reference.velocity_ned_m_s,
@@ -271,8 +335,16 @@ class PeerTable:
 
         One whose presence ended was seen alive until shortly before, so it stopped no earlier than PRESENCE_DELAY_S
         before that; one that fell silent may have stopped at any time since its last sample. A vehicle that hears
-        nobody holds by itself after `isolated_flight_s`, so it flew on no longer than that.
+        nobody holds by itself after `isolated_flight_s`, so it flew on no longer than that. One that climbed or landed
+        is somewhere in the column between there and its altitude, or the ground.
         """
+        if sample.phase not in FORMATION_PHASES:
+            last = sample.position_ned_m
+            slot = self.programme.reference(sample.vehicle_id, sample.time_ns).position_ned_m
+            ends = {Phase.CLIMBING: min(slot.down, last.down), Phase.LANDING: max(0.0, last.down)}
+            if sample.phase in ends:
+                return Ned(last.north, last.east, ends[sample.phase]), ZERO, last
+            return *held(sample, (ZERO, ZERO), _NOWHERE, now.fleet_ns, self.limits), last
 
         def at(fleet_ns: int) -> tuple[Ned, Ned]:
             reference = self.programme.reference(sample.vehicle_id, fleet_ns)

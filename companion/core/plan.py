@@ -18,10 +18,14 @@ from companion.core.values import ZERO
 
 PLAN_ACCELERATION_M_S2 = 0.5
 """the largest acceleration with which a leg changes the centre's velocity"""
+PAD_TOLERANCE_M = 0.05
 TURN_RAMP_S = 3.0
 """time in which a turn's rate is built up and taken back"""
 SPEED_SAMPLES = 16
 """moments of a leg without a steady course at which its speed is looked at"""
+PADS = "pads"
+"""name of the formation in which each vehicle is over its own pad"""
+Then = Literal["stay", "land", "return"]
 BLEND_MIN_S = 8.0
 """shortest time in which slots move from one formation to the next"""
 
@@ -188,10 +192,7 @@ def _goto_leg(leg: GotoLeg, p0: Ned, v0: Ned, t: float) -> _Centre:
     whole = leg.duration_s
     x = min(t / whole, 1.0)
     m, m1, m2 = minimum_jerk(x)
-    # The start's velocity fades by the quintic with value 0, slope 1 at 0 and rest at 1.
-    f = x - 6 * x**3 + 8 * x**4 - 3 * x**5
-    f1 = 1 - 18 * x**2 + 32 * x**3 - 15 * x**4
-    f2 = -36 * x + 96 * x**2 - 60 * x**3
+    f, f1, f2 = fading(x)
     way = Ned(*(b - a for a, b in zip(p0, leg.target_ned_m, strict=True)))
     return _Centre(
         Ned(*(p + d * m + v * whole * f for p, d, v in zip(p0, way, v0, strict=True))),
@@ -208,6 +209,17 @@ def minimum_jerk(x: float) -> tuple[float, float, float]:
         x * x * x * (10.0 - 15.0 * x + 6.0 * x * x),
         30.0 * x * x * (1.0 - x) ** 2,
         60.0 * x * (1.0 - x) * (1.0 - 2.0 * x),
+    )
+
+
+def fading(x: float) -> tuple[float, float, float]:
+    """Value, slope and curvature over x in [0, 1] of the quintic with value 0, slope 1 at 0 and rest at 1: by it a
+    velocity from before fades."""
+    x = min(max(x, 0.0), 1.0)
+    return (
+        x - 6 * x**3 + 8 * x**4 - 3 * x**5,
+        1 - 18 * x**2 + 32 * x**3 - 15 * x**4,
+        -36 * x + 96 * x**2 - 60 * x**3,
     )
 
 
@@ -307,8 +319,8 @@ class Motion:
     """left over from a turn that these legs interrupt; it dies out within TURN_RAMP_S"""
     heading_follows_turns: bool
     legs: tuple[Leg, ...]
-    then: Literal["stay", "land"] = "stay"
-    """what the vehicles do when the last leg has ended"""
+    then: Then = "stay"
+    """what the vehicles do when the last leg has ended; "return": they fly back over their pads, and land there"""
 
     @property
     def order(self) -> tuple[int, int, int]:
@@ -342,6 +354,32 @@ class Motion:
     def blend_end_ns(self) -> int:
         """Fleet time at which the slots are those of the new formation."""
         return self.blend_start_ns + round(self.blend_s * 1e9)
+
+    @property
+    def returns(self) -> bool:
+        """Whether it brings the vehicles back over their pads, to land there."""
+        return self.shape == PADS and self.then == "land"
+
+    @property
+    def climb_at_end_m_s(self) -> float:
+        """Vertical speed of the centre with which the motion goes on for ever (m/s, up)."""
+        return -self._starts[-1][2].down
+
+    def activity(self, fleet_ns: int) -> Literal["none", "legs", "rest"]:
+        """What the legs do at a time: there are none, they run, or the centre rests after or within them."""
+        if not self.legs:
+            return "none"
+        t = (fleet_ns - self.legs_start_ns) * 1e-9
+        starts = self._starts
+        k = 0
+        while k + 1 < len(starts) and t >= starts[k + 1][0]:
+            k += 1
+        since, _, v, _ = starts[k]
+        if k >= len(self.legs):
+            return "rest" if v == ZERO else "legs"
+        leg = self.legs[k]
+        stops = isinstance(leg, VelocityLeg) and leg.velocity_ned_m_s == ZERO
+        return "rest" if stops and t - since >= _ramp_s(v) else "legs"
 
     def moment(self, fleet_ns: int) -> Moment:
         """The centre, the heading and the blend at a time; before the legs' start the centre's velocity is constant."""
@@ -404,7 +442,7 @@ def with_legs(
     at_ns: int,
     issuer: int,
     legs: tuple[Leg, ...],
-    then: Literal["stay", "land"] = "stay",
+    then: Then = "stay",
     heading_follows_turns: bool | None = None,
 ) -> Motion:
     """The motion that takes over from `motion` at `at_ns` with other legs; the slots go on as they were."""
@@ -448,6 +486,55 @@ def with_formation(
         slots={i: SlotChange(a, b) for i, a, b in zip(ids, before, after, strict=True)},
         blend_start_ns=at_ns,
         blend_s=blend_duration_s(way, speed_m_s),
+    )
+
+
+def with_return(motion: Motion, home: Motion, *, at_ns: int, issuer: int, speed_m_s: float) -> Motion:
+    """The motion that takes over from `motion` at `at_ns` and brings every vehicle back over its own pad, to land.
+
+    `home` is the first motion, in which each stands over its pad. The centre flies to the pads' centre while the slots
+    pass into the pads' arrangement, each vehicle to its own; neither is faster than `speed_m_s`.
+    """
+    centre = home.moment(0).centre.position
+    here = motion.moment(at_ns)
+    far = at_ns + round(1e9 * TURN_RAMP_S)
+    stopped = with_legs(motion, at_ns=at_ns, issuer=issuer, legs=(VelocityLeg(ZERO, 0.0),))
+    c, s = cos(stopped.moment(far).heading_rad), sin(stopped.moment(far).heading_rad)
+    slots = {}
+    for i, (a, b) in motion.slots.items():
+        pad = home.reference(i, 0).position_ned_m
+        north, east, down = (x - y for x, y in zip(pad, centre, strict=True))
+        before = Ned(*(x + here.blend[0] * (y - x) for x, y in zip(a, b, strict=True)))
+        slots[i] = SlotChange(before, Ned(c * north + s * east, c * east - s * north, down))
+    way = max(dist(*change) for change in slots.values())
+    flown_m = dist(here.centre.position, centre)
+    # A centre that still flies away comes to rest first: as much more way as its stopping takes.
+    flown_m += hypot(*here.centre.velocity) ** 2 / (2 * PLAN_ACCELERATION_M_S2)
+    seconds = max(blend_duration_s(way, speed_m_s), goto_duration_s(flown_m, speed_m_s))
+    return replace(
+        stopped, shape=PADS, slots=slots, blend_start_ns=at_ns, blend_s=seconds,
+        legs=(GotoLeg(centre, seconds),), then="land",
+    )  # fmt: skip
+
+
+def over_the_pads(motion: Motion, home: Motion) -> bool:
+    """Whether the slots of a motion of shape "pads" are the pads' arrangement, and a return ends over each own pad."""
+    ids = sorted(home.slots)
+    if set(ids) != set(motion.slots):
+        return False
+    rows = [(motion.slots[i].after, home.slots[i].after) for i in ids]
+    if any(
+        abs(dist(a, b) - dist(pad_a, pad_b)) > PAD_TOLERANCE_M
+        for k, (a, pad_a) in enumerate(rows)
+        for b, pad_b in rows[:k]
+    ):
+        return False
+    if not motion.returns or motion.end_ns is None:
+        return not motion.returns
+    end = motion.moment(motion.end_ns)
+    return all(
+        dist(end.slot(motion.slots[i]).position_ned_m, home.reference(i, 0).position_ned_m) <= PAD_TOLERANCE_M
+        for i in ids
     )
 
 

@@ -23,18 +23,38 @@ class Phase(IntEnum):
     """Where a vehicle is in its flight; `core.phase` holds every transition."""
 
     IDLE = 0
-    ARMED = 1
-    CLIMBING = 2
-    FORMING = 3
-    FORMED = 4
-    LANDING = 5
-    LANDED = 6
-    RELEASED = 7
+    PREFLIGHT = 1
+    """take-off is commanded, and the autopilot is asked to arm"""
+    ARMED = 2
+    CLIMBING = 3
+    WAITING = 4
+    """at altitude over the own pad, following our setpoints, until the others are there"""
+    FORMING = 5
+    FORMED = 6
+    MOVING = 7
+    """the plan's legs run"""
+    HOLDING = 8
+    """the formation stands, after it has moved or on command"""
+    RETURNING = 9
+    """on the way to the places over the pads"""
+    APART = 10
+    """stands by itself or comes back to its slot: steered by its own filter, and no part of the formation"""
+    LANDING = 11
+    LANDED = 12
+    RELEASED = 13
     """the pilot or the autopilot's own failsafe has the vehicle; we send nothing"""
 
 
-FILTERED_PHASES = frozenset({Phase.FORMING, Phase.FORMED})
-"""phases in which a vehicle's own safety filter steers it, so that a pair shares the avoidance"""
+FORMATION_PHASES = frozenset({Phase.WAITING, Phase.FORMING, Phase.FORMED, Phase.MOVING, Phase.HOLDING, Phase.RETURNING})
+"""phases in which a vehicle follows its slot, so that a pair shares the avoidance"""
+FILTERED_PHASES = FORMATION_PHASES | {Phase.APART}
+"""phases in which a vehicle's own safety filter steers it"""
+SETTLED_PHASES = frozenset({Phase.FORMED, Phase.MOVING, Phase.HOLDING})
+"""phases of a vehicle that has taken its slot"""
+AIRBORNE_PHASES = FILTERED_PHASES | {Phase.CLIMBING, Phase.LANDING, Phase.RELEASED}
+"""phases in which a vehicle that says nothing more cannot be taken to stand where it was"""
+FLYING_PHASES = FILTERED_PHASES | {Phase.ARMED, Phase.CLIMBING, Phase.LANDING}
+"""phases in which a vehicle hangs on its companion"""
 
 
 class VehicleState(NamedTuple):

@@ -23,6 +23,7 @@ from typing import Any
 
 from companion.agent import Agent, Outputs
 from companion.config import STALE_AFTER, FleetConfig
+from companion.core.failsafe import CONFIGURATION_S, Failsafe
 from companion.core.values import Instant
 from companion.errors import CompanionError
 from companion.io.clock import FleetClock
@@ -55,6 +56,8 @@ class RunSettings:
     stop_fd: int | None = None
     """a file descriptor whose end of file means that the launcher is gone"""
     log: Callable[[str], None] = print
+    configuration: Path | None = None
+    """the file that the configuration was read from: a change of it in flight is noted"""
 
 
 def network_settings(config: FleetConfig, vehicle_id: int | None) -> PeerNetworkSettings:
@@ -117,6 +120,9 @@ class Companion:
         except BaseException:
             self._resources.close()
             raise
+        self._file = self._configuration()
+        self._file_due_ns = 0
+        self._noticed: set[Failsafe] = set()
         self._stop_by_ns: int | None = None
         self._last_ns = 0
         self._second_ns = 0
@@ -131,6 +137,20 @@ class Companion:
     def _wake(self) -> None:
         with suppress(OSError):  # full: the loop wakes anyway; closed: it has ended
             self._wake_write.send(b"\0")
+
+    def _configuration(self) -> bytes | None:
+        try:
+            return None if self.settings.configuration is None else self.settings.configuration.read_bytes()
+        except OSError:
+            return None
+
+    def _notice(self, failsafe: Failsafe, now_ns: int) -> None:
+        """Tell the agent, once, what only the process can see."""
+        if failsafe not in self._noticed:
+            self._noticed.add(failsafe)
+            now = self._instant(now_ns)
+            self._record("input/notice", now, failsafe.name.encode())
+            self.agent.notice(failsafe, now)
 
     def close(self) -> None:
         """Release everything, the Zenoh session first."""
@@ -289,4 +309,10 @@ class Companion:
         own_id_heard = self.network.counters.own_id_heard
         if own_id_heard > self._own_id_heard:
             self._own_id_heard, self._own_id_ns = own_id_heard, now_ns
+        if self.recorder is not None and self.recorder.failure is not None:
+            self._notice(Failsafe.DISK_FULL, now_ns)
+        if now_ns >= self._file_due_ns:
+            self._file_due_ns = now_ns + round(CONFIGURATION_S * 1e9)
+            if self._configuration() != self._file:
+                self._notice(Failsafe.CONFIGURATION, now_ns)
         self._record("traffic", self._instant(now_ns), TRAFFIC_RECORD.pack(tcp_bytes_sent()))

@@ -384,6 +384,15 @@ def arm_parameters(arm: bool) -> tuple[int, float]:
     return mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0 if arm else 0.0
 
 
+FORCE = 21196.0
+"""param2 of MAV_CMD_COMPONENT_ARM_DISARM by which motors stop in flight too"""
+
+
+def kill_parameters() -> tuple[int, float, float]:
+    """Command and parameters that disarm at once, wherever the vehicle is."""
+    return mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0.0, FORCE
+
+
 def mode_parameters(mode: Px4Mode) -> tuple[int, float, float, float]:
     """Command and parameters of MAV_CMD_DO_SET_MODE for a PX4 mode."""
     main, sub = (mode >> 16) & 0xFF, (mode >> 24) & 0xFF

@@ -20,7 +20,8 @@ from companion.core.plan import GotoLeg, Leg, Motion, SlotChange, TurnLeg, Veloc
 from companion.core.values import PeerMessage, PeerSample, Phase
 from companion.errors import WireError
 
-VERSION = 1
+VERSION = 2
+"""2: thirteen phases instead of seven"""
 PLAUSIBLE_MAX = 1e6
 """no position (m) or velocity (m/s) is larger than this: float32 holds far more, and squares of it overflow later"""
 _HEADER = struct.Struct("<BBBBIIIqB")
@@ -109,7 +110,7 @@ class _GotoLeg(_Model):
 
 
 class _Motion(_Model):
-    version: Literal[1]
+    version: Literal[2]
     revision: Annotated[int, Field(ge=0, lt=1 << 32)]
     start_ns: Annotated[int, Field(ge=0, lt=1 << 63)]
     issuer: Annotated[int, Field(ge=0, le=255)]
@@ -126,7 +127,7 @@ class _Motion(_Model):
     legs: Annotated[
         tuple[Annotated[_VelocityLeg | _TurnLeg | _GotoLeg, Field(discriminator="kind")], ...], Field(max_length=100)
     ]
-    then: Literal["stay", "land"]
+    then: Literal["stay", "land", "return"]
 
 
 def encode_motion(motion: Motion) -> bytes:

@@ -30,8 +30,8 @@ def test_the_recording_is_a_whole_flight_and_small() -> None:
     notes = [e.body.decode().split(":")[0] for e in recording.entries if e.channel == "note"]
     flown = [n for n in notes if " -> " in n]
     assert flown == [
-        "idle -> armed", "armed -> climbing", "climbing -> forming", "forming -> formed", "formed -> landing",
-        "landing -> landed",
+        "idle -> preflight", "preflight -> armed", "armed -> climbing", "climbing -> waiting", "waiting -> forming",
+        "forming -> formed", "formed -> moving", "moving -> landing", "landing -> landed",
     ]  # fmt: skip
     assert "failsafe" not in notes
     channels = Counter(e.channel for e in recording.entries)

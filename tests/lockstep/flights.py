@@ -179,3 +179,21 @@ def check_setpoint(datagram: bytes, config: FleetConfig) -> bool:
     assert np.hypot(m.afx, m.afy) <= limits.avoidance_acceleration_m_s2 * (1 + 1e-6), numbers
     assert -limits.climb_max_m_s * (1 + 1e-6) <= m.vz <= limits.descent_max_m_s * (1 + 1e-6), numbers
     return True
+
+
+class InLockstep:
+    """The operator's link into a fleet in lockstep."""
+
+    def __init__(self, ls: Lockstep) -> None:
+        self.ls = ls
+
+    def ask(
+        self, vehicle_ids: Iterable[int], kind: str, payload: bytes, timeout_s: float, retry_s: float
+    ) -> dict[int, bytes | None]:
+        if kind == "command":
+            answers = self.ls.command(payload, *vehicle_ids)
+        else:
+            answers = {
+                i: json.dumps(v.agent.status(self.ls.now)).encode() for i, v in self.ls.vehicles.items() if v.alive
+            }
+        return {i: answers.get(i) for i in vehicle_ids}

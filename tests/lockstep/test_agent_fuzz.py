@@ -16,7 +16,7 @@ from pymavlink.dialects.v20 import development as dialect
 from companion.agent import Agent
 from companion.core.frames import Ned
 from companion.core.values import Instant, PeerMessage, PeerSample, Phase
-from companion.wire.peer import encode_motion, encode_state
+from companion.wire.peer import VERSION, encode_motion, encode_state
 from sim.lockstep import UTC_AT_START_NS, Lockstep
 
 pytestmark = pytest.mark.timeout(600)
@@ -24,6 +24,11 @@ pytestmark = pytest.mark.timeout(600)
 
 CONFIG = fleet(3)
 WORLD: Any = dialect.MAVLink(None, srcSystem=1, srcComponent=1)
+
+
+def ordered(revision: int, motion: bytes) -> bytes:
+    """A command to fly a motion."""
+    return b'{"verb":"motion","revision":%d,"issuer":"x","motion":%s}' % (revision, motion)
 
 
 class Noise:
@@ -92,12 +97,12 @@ class Noise:
 
         about, entries = r.randrange(256), r.randrange(4)
         payload = struct.pack(
-            "<BBBBIIIqB", 1, about, r.randrange(10), entries, r.getrandbits(32), r.getrandbits(32),
+            "<BBBBIIIqB", VERSION, about, r.randrange(15), entries, r.getrandbits(32), r.getrandbits(32),
             r.choice([0, 1, 2, 2**32 - 1]), r.choice([0, now.fleet_ns, 2**63 - 1, -(2**63)]), r.randrange(256),
         )  # fmt: skip
         payload += sample()
         for _ in range(entries):
-            payload += struct.pack("<BBI", r.randrange(1, 5), r.randrange(9), r.getrandbits(32)) + sample()
+            payload += struct.pack("<BBI", r.randrange(1, 5), r.randrange(15), r.getrandbits(32)) + sample()
         return f"fleet/{about}/state", payload
 
     def lie(self, vehicle_id: int, now: Instant) -> tuple[str, bytes]:
@@ -167,7 +172,7 @@ class Noise:
                     [b"", b"null", b"{}", b"[" * 5000, b'{"verb":{}}', b'{"verb":"motion"}', r.randbytes(20)]
                 )
                 if r.random() < 0.5:
-                    command = b'{"verb":"motion","motion":' + self.motion(ls) + b"}"
+                    command = ordered(r.randrange(1, 4), self.motion(ls))
                 answer = json.loads(agent.receive_command(command, now))
                 assert answer["accepted"] in (True, False)
 
@@ -227,7 +232,7 @@ def refused(noise: Noise, ls: Lockstep, i: int) -> None:
 
     key = f"fleet/{other}/state"
     agent.receive_peer(key, state(other)[:-1], now)
-    agent.receive_peer(key, b"\x02" + state(other)[1:], now)
+    agent.receive_peer(key, b"\x01" + state(other)[1:], now)
     agent.receive_peer(key, state(other, position_ned_m=Ned(nan, 0.0, 0.0)), now)
     agent.receive_peer(key, state(other, velocity_ned_m_s=Ned(0.0, 1e30, 0.0)), now)
     agent.receive_peer(key, state(other, time_ns=now.fleet_ns + 2_000_000_000), now)
@@ -237,15 +242,15 @@ def refused(noise: Noise, ls: Lockstep, i: int) -> None:
     agent.receive_peer("fleet/1/other", state(other), now)
     newest: Any = json.loads(encode_motion(agent.programme.newest))
     for wrong in (
-        {"version": 2}, {"slots": {"1": newest["slots"]["1"]}}, {"start_ns": 0}, {"shape": "star"},
+        {"version": 1}, {"slots": {"1": newest["slots"]["1"]}}, {"start_ns": 0}, {"shape": "star"},
         {"velocity_ned_m_s": [50, 0, 0]}, {"centre_ned_m": [nan, 0, 0]}, {"legs_start_ns": -1},
     ):  # fmt: skip
         plan = json.dumps({**newest, "revision": newest["revision"] + 1, **wrong}).encode()
         agent.receive_peer(f"fleet/{other}/plan", plan, now)
-        agent.receive_command(b'{"verb":"motion","motion":' + plan + b"}", now)
+        agent.receive_command(ordered(9, plan), now)
     agent.receive_presence(77, True, now)
     agent.receive_presence(77, False, now)
-    for command in (b"", b"[]", b"[" * 5000, b"\xff", b'{"verb":"fly"}', b'{"verb":"motion"}'):
+    for command in (b"", b"[]", b"[" * 5000, b"\xff", b'{"verb":"fly"}', b'{"verb":"motion"}', ordered(3, b"1")):
         answer = json.loads(agent.receive_command(command, now))
         assert answer["accepted"] is False
         assert answer["reason"]
@@ -276,7 +281,7 @@ def test_what_is_refused_is_counted_and_changes_not_one_bit_of_what_is_sent() ->
         "malformed", "not finite", "out of range", "foreign system", "state: length", "state: version",
         "state: not finite", "state: out of range", "from the future", "state: id is not the key's", "foreign id",
         "own id", "peer: unknown topic", "plan: motion", "command: malformed", "command: motion",
-        "command: unknown verb", "plan: its vehicles are not this fleet's",
+        "command: unknown verb", "command: revision", "plan: its vehicles are not this fleet's",
     ):  # fmt: skip
         assert counted[kind] > 50, (kind, counted)
 
@@ -324,7 +329,7 @@ def test_any_order_of_events_leaves_an_agent_that_goes_on(events: list[tuple[str
                     bytes(dialect.MAVLink_gps_global_origin_message(*value, 488_000, 0).pack(WORLD)), now
                 )
             case "peer":
-                agent.receive_peer("fleet/1/state", b"\x01\x01" + value, now)
+                agent.receive_peer("fleet/1/state", bytes((VERSION, 1)) + value, now)
             case "presence":
                 about, alive = value
                 agent.receive_presence(about, alive, now)

@@ -1,13 +1,13 @@
 """Flights in which something fails: a companion, the network, a pilot's patience."""
 
 import json
-from collections.abc import Iterable
 from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
 from flights import (
+    InLockstep,
     check_setpoint,
     distances,
     errors,
@@ -101,7 +101,7 @@ def test_the_others_keep_apart_from_each_other_and_from_the_lost_one(killed: Kil
 
 def test_the_others_find_their_formation_again_and_land(killed: Killed) -> None:
     ls = killed.ls
-    landing_s = min(first(ls, "formed -> landing", i) for i in killed.others)
+    landing_s = min(first(ls, "moving -> landing", i) for i in killed.others)
     t = truth(ls, landing_s - 4.0, landing_s)
     formation, _ = errors(ls, t, killed.others)
     assert np.sqrt(np.square(formation).mean()) <= 0.2
@@ -141,7 +141,7 @@ class TakenOver:
         self.ls.vehicles[2].autopilot.inject(Fault(FaultKind.PILOT_TAKEOVER))
         wait(self.ls, 3.0)
         self.answers = {i: json.loads(a) for i, a in self.ls.command(b'{"verb":"takeoff"}').items()}
-        self.land_answer = json.loads(self.ls.vehicles[2].agent.receive_command(b'{"verb":"land"}', self.ls.now))
+        self.land_answer = json.loads(self.ls.command(b'{"verb":"land"}', 2)[2])
         wait(self.ls, 5.0)
         self.cut_s = self.ls.now_ns * 1e-9
         self.ls.partition({1}, {2}, {3})
@@ -168,7 +168,9 @@ def test_nothing_but_heartbeats_is_said_to_an_autopilot_that_the_pilot_has(taken
     # What the companion asked for before is withdrawn too: the mode stays the pilot's, and commands are refused.
     assert taken.answers[2]["reason"] == "the pilot has the vehicle"
     assert taken.land_answer["accepted"] is False
-    assert [note for i, note in failsafes(taken.ls) if i == 2] == ["failsafe: autopilot left our control: POSCTL"]
+    assert [note for i, note in failsafes(taken.ls) if i == 2] == [
+        "failsafe: OFFBOARD left by the pilot: POSCTL: hand over"
+    ]
 
 
 def test_the_others_hold_their_formation_without_the_one_that_was_taken(taken: TakenOver) -> None:
@@ -181,7 +183,7 @@ def test_the_others_hold_their_formation_without_the_one_that_was_taken(taken: T
 def test_a_vehicle_that_hears_nobody_lands_though_they_are_still_said_to_be_there(taken: TakenOver) -> None:
     limits = taken.ls.config.peer_limits
     for i in (1, 3):
-        alone_s = first(taken.ls, "all peers lost", i) - taken.cut_s
+        alone_s = first(taken.ls, "all peers lost: hold", i) - taken.cut_s
         assert limits.isolated_flight_s < alone_s < limits.stale_after_s + limits.isolated_flight_s + 0.5
     assert distances(truth(taken.ls, taken.cut_s)).min() >= CLEARANCE_M
 
@@ -209,7 +211,7 @@ class BadNetwork:
             motion = with_legs(now, at_ns=ls.now.fleet_ns + 2_000_000_000 + k, issuer=0, legs=(leg,))
             self.orders.append(motion.order)
             command = json.dumps({"verb": "motion", "motion": json.loads(encode_motion(motion))}).encode()
-            assert json.loads(ls.vehicles[i].agent.receive_command(command, ls.now))["accepted"]
+            assert json.loads(ls.command(command, i)[i])["accepted"]
         wait(ls, 3.0)
         self.agreed = {v.agent.programme.newest.order for v in ls.vehicles.values()}
         wait(ls, 5.0)
@@ -252,24 +254,6 @@ def test_two_halves_that_do_not_hear_each_other_fly_on_and_are_one_formation_aft
 
 
 # -- the operator ----------------------------------------------------------------------------------------------------
-
-
-class InLockstep:
-    """The operator's link into a fleet in lockstep."""
-
-    def __init__(self, ls: Lockstep) -> None:
-        self.ls = ls
-
-    def ask(
-        self, vehicle_ids: Iterable[int], kind: str, payload: bytes, timeout_s: float, retry_s: float
-    ) -> dict[int, bytes | None]:
-        if kind == "command":
-            answers = self.ls.command(payload)
-        else:
-            answers = {
-                i: json.dumps(v.agent.status(self.ls.now)).encode() for i, v in self.ls.vehicles.items() if v.alive
-            }
-        return {i: answers.get(i) for i in vehicle_ids}
 
 
 class Operated:
@@ -335,7 +319,7 @@ def test_hold_brings_the_formation_to_rest(operated: Operated) -> None:
 def test_status_tells_of_every_vehicle_where_it_is_in_the_flight(operated: Operated) -> None:
     for i, told in operated.status.items():
         assert told is not None
-        assert (told["vehicle"], told["phase"], told["mode"], told["shape"]) == (i, "formed", "OFFBOARD", "line")
+        assert (told["vehicle"], told["phase"], told["mode"], told["shape"]) == (i, "holding", "OFFBOARD", "line")
         assert told["neighbours"] == 3
         assert told["ready"] == []
 
@@ -360,7 +344,7 @@ def test_a_vehicle_whose_autopilot_fell_silent_is_released_and_its_peers_know_an
     wait(ls, 0.5)
     for i in (1, 3):
         assert ls.vehicles[i].agent.peers.phases()[2] is Phase.RELEASED
-    assert (2, "failsafe: own position lost: the vehicle is left to its autopilot") in failsafes(ls)
+    assert (2, "failsafe: own position lost: hand over") in failsafes(ls)
     until(ls, 60.0, lambda: all(ls.phases()[i] is Phase.LANDED for i in (1, 3)))
     assert not ls.vehicles[2].autopilot.truth().armed, "its autopilot landed by itself"
     assert distances(truth(ls, muted_s)).min() > CLEARANCE_M

@@ -84,8 +84,8 @@ def test_ten_vehicles_take_off_form_fly_their_plan_and_land_without_a_failsafe(t
     for i in ten.ls.vehicles:
         passed = [n.split(":")[0] for _, v, n in ten.ls.notes if v == i and " -> " in n]
         assert passed == [
-            "idle -> armed", "armed -> climbing", "climbing -> forming", "forming -> formed", "formed -> landing",
-            "landing -> landed",
+            "idle -> preflight", "preflight -> armed", "armed -> climbing", "climbing -> waiting",
+            "waiting -> forming", "forming -> formed", "formed -> moving", "moving -> landing", "landing -> landed",
         ]  # fmt: skip
 
 

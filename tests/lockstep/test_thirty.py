@@ -34,6 +34,7 @@ def test_thirty_vehicles_change_from_v_to_circle_to_line() -> None:
     for shape in ("circle", "line"):
         asked_s = ls.now_ns * 1e-9
         assert operator.form(shape, ls.now.fleet_ns).all_accepted
+        wait(ls, 0.1)
         assert ls.all_in(Phase.FORMING)
         until(ls, SETTLED_WITHIN_S, lambda: ls.all_in(Phase.FORMED))
         wait(ls, 5.0)

@@ -163,9 +163,13 @@ def _essence(status: dict[str, Any]) -> dict[str, Any]:
     return {k: status[k] for k in ("phase", "mode", "ready", "revision", "shape", "failsafes", "rejected")}
 
 
-def all_in(ids: list[int], phase: str, revision: int = 0) -> Callable[[dict[int, dict[str, Any]]], bool]:
-    """Whether all of these vehicles are in that phase, under a motion of at least that revision."""
-    return lambda said: all(i in said and said[i]["phase"] == phase and said[i]["revision"] >= revision for i in ids)
+SETTLED = ("formed", "moving", "holding")
+"""phases of a vehicle that has taken its slot"""
+
+
+def all_in(ids: list[int], *phases: str, revision: int = 0) -> Callable[[dict[int, dict[str, Any]]], bool]:
+    """Whether all of these vehicles are in one of the phases, under a motion of at least that revision."""
+    return lambda said: all(i in said and said[i]["phase"] in phases and said[i]["revision"] >= revision for i in ids)
 
 
 def eventually(condition: Callable[[], bool], timeout_s: float = PATIENCE_S) -> bool:

@@ -25,6 +25,7 @@ import pytest
 import tomli_w
 import zenoh
 from fleet_process import (
+    SETTLED,
     Fleet,
     Process,
     Status,
@@ -184,9 +185,9 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
     out = fleet.folder / "flights"
     arguments = ("sim", "up", "--json", "--fleet", str(fleet.file), "--out", str(out), "--plan", FOR_EVER)
     with started(*arguments, folder=fleet.folder, name="up") as up, operator_of(fleet) as operator:
-        flown.seen["formed"] = wait_status(operator, all_in(fleet.ids, "formed", revision=2))
+        flown.seen["formed"] = wait_status(operator, all_in(fleet.ids, *SETTLED, revision=2))
         flown.say("form", "line")
-        flown.seen["form"] = wait_status(operator, all_in(fleet.ids, "formed", revision=3))
+        flown.seen["form"] = wait_status(operator, all_in(fleet.ids, *SETTLED, revision=3))
         send(fleet.port, datagrams(1) * 3)
         put_garbage(fleet)
         _, flown.after_garbage = status_json(fleet)
@@ -283,7 +284,7 @@ def test_a_stranger_on_the_autopilots_port_is_counted_and_moves_nothing(flown: F
     status = flown.after_garbage[1]
     assert status is not None
     assert rejected(status, "mavlink: another address than the autopilot's") == 3 * len(datagrams(1))
-    assert status["phase"] == "formed"
+    assert status["phase"] in SETTLED
     assert status["mode"] == "OFFBOARD"
 
 
@@ -291,7 +292,7 @@ def test_garbage_from_peers_is_counted_by_kind_and_moves_nothing(flown: Flown) -
     for i in (1, 2, 3):
         status = flown.after_garbage[i]
         assert status is not None
-        assert status["phase"] == "formed"
+        assert status["phase"] in SETTLED
         assert failsafes(status["failsafes"]) == []
         for kind, count in {
             "state: version": 2,
@@ -341,7 +342,7 @@ def loss(tmp_path_factory: pytest.TempPathFactory) -> Loss:
     out = fleet.folder / "flights"
     arguments = ("sim", "up", "--fleet", str(fleet.file), "--out", str(out), "--plan", FOR_EVER)
     with started(*arguments, folder=fleet.folder, name="up") as up, operator_of(fleet) as operator:
-        wait_status(operator, all_in(fleet.ids, "formed", revision=2))
+        wait_status(operator, all_in(fleet.ids, *SETTLED, revision=2))
         loss.folder = flight_folder(out)
         resource.prlimit(child(up.popen.pid, "run --vehicle 3 "), resource.RLIMIT_FSIZE, (0, 0))
         os.kill(child(up.popen.pid, "run --vehicle 2 "), signal.SIGKILL)
@@ -365,7 +366,7 @@ def test_the_lost_vehicles_autopilot_lands_it_by_its_own_failsafe(loss: Loss) ->
 def test_the_others_fly_on_and_keep_their_distance(loss: Loss) -> None:
     assert sorted(loss.others) == [1, 3, 4]
     for status in loss.others.values():
-        assert status["phase"] == "formed"
+        assert status["phase"] in SETTLED
         assert failsafes(status["failsafes"]) == []
     assert minimum_distance_m(loss.folder / "truth.bin") >= 1.2
 
@@ -388,7 +389,7 @@ def test_ctrl_c_lands_the_fleet_and_still_writes_the_summary(loss: Loss) -> None
 
 def test_a_companion_that_can_write_no_more_flies_on(loss: Loss) -> None:
     assert loss.others[3]["recorder_lost"] > 0
-    assert loss.others[3]["phase"] == "formed"
+    assert loss.others[3]["phase"] in SETTLED
 
 
 def test_without_a_terminal_progress_is_a_line_now_and_then(loss: Loss) -> None:
@@ -412,7 +413,7 @@ def test_no_child_outlives_a_launcher_killed_in_flight_and_the_vehicles_are_land
     out = tmp_path / "flights"
     with started("sim", "up", "--fleet", str(fleet.file), "--out", str(out), folder=tmp_path) as up:
         with operator_of(fleet) as operator:
-            wait_status(operator, all_in(fleet.ids, "forming"))
+            wait_status(operator, all_in(fleet.ids, "waiting", "forming"))
         pids = list(children(up.popen.pid).values())
         assert len(pids) == 2 + len(fleet.ids)
         up.signal(signal.SIGKILL)
@@ -510,7 +511,7 @@ def single(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Single]:
         single.busy = run("companion", "run", "--vehicle", "1", "--fleet", str(fleet.file), folder=folder)
         wait_status(operator, lambda said: ready_but_for(said, [1, 2, 3], []))
         assert operator.take_off().all_accepted
-        single.flying = wait_status(operator, all_in(fleet.ids, "formed", revision=2))
+        single.flying = wait_status(operator, all_in(fleet.ids, *SETTLED, revision=2))
         third.signal(signal.SIGKILL)
         third.wait()
         again = mine.start(3)
@@ -566,7 +567,7 @@ def test_take_off_is_refused_while_a_vehicle_is_missing(single: Single) -> None:
 
 
 def test_a_companion_that_comes_late_flies_with_the_others(single: Single) -> None:
-    assert {s["phase"] for s in single.flying.values()} == {"formed"}
+    assert {s["phase"] for s in single.flying.values()} <= set(SETTLED)
     assert len(single.flying) == 3
 
 
@@ -592,7 +593,7 @@ def test_a_companion_restarted_in_flight_gets_the_plan_and_leaves_its_vehicle_to
 
 def test_a_companion_restarted_in_flight_does_not_disturb_the_others(single: Single) -> None:
     for i in (1, 2):
-        assert single.restarted[i]["phase"] == "formed"
+        assert single.restarted[i]["phase"] in SETTLED
         assert failsafes(single.restarted[i]["failsafes"]) == []
     assert minimum_distance_m(single.truth) >= 1.2
 

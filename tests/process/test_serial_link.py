@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fleet_process import all_in, make_fleet, operator_of, started, wait_status
+from fleet_process import SETTLED, all_in, make_fleet, operator_of, started, wait_status
 from pymavlink.dialects.v20 import development as dialect
 from stub_process import QUICK
 
@@ -153,7 +153,7 @@ def test_a_vehicle_flies_over_a_serial_line(tmp_path: Path) -> None:
             ):
                 wait_status(operator, lambda said: 1 in said and said[1]["ready"] == [])
                 assert operator.take_off().all_accepted
-                said = wait_status(operator, all_in([1], "formed"))
+                said = wait_status(operator, all_in([1], *SETTLED))
                 assert said[1]["rejected"].get("malformed", 0) == 0
                 assert operator.land().all_accepted
                 wait_status(operator, all_in([1], "landed"))

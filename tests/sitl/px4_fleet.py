@@ -46,12 +46,13 @@ class Flying:
         return flight_folder(self.fleet.folder / "flights")
 
     def wait(self, phase: str, *ids: int) -> None:
-        """Until these vehicles (or all) are in that phase."""
+        """Until these vehicles (or all) are in that phase; who moves or holds has formed."""
+        phases = ("formed", "moving", "holding") if phase == "formed" else (phase,)
         wanted = ids or tuple(self.fleet.ids)
 
         def enough(said: dict[int, dict[str, Any]]) -> bool:
             assert self.up.popen.poll() is None, self.up.err
-            return all(i in said and said[i]["phase"] == phase for i in wanted)
+            return all(i in said and said[i]["phase"] in phases for i in wanted)
 
         wait_status(self.operator, enough, PATIENCE_S)
 

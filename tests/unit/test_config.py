@@ -134,7 +134,7 @@ RANGES = [
     ("formation.spacing_m", -4.0, "a finite number > 0 and <= 1000 m"),
     ("formation.heading_deg", 361, "a finite number >= -360 and <= 360 deg"),
     ("formation.altitude_m", 0.5, "a finite number >= 1 and <= 500 m"),
-    ("plan.then", "hover", "'stay' or 'land'"),
+    ("plan.then", "hover", "'stay', 'land' or 'return'"),
     ("plan.heading", "north", "'fixed' or 'track'"),
     ("plan.automatic", 1, "a valid boolean"),
     (f"{VELOCITY}.kind", "loop", "one of hold, velocity, turn, goto"),

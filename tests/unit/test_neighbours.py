@@ -95,7 +95,8 @@ def predicted(t: PeerTable, seconds: float, gated: bool = False) -> dict[int, Ne
         ({"velocity_ned_m_s": Ned(0.0, nan, 0.0)}, "not finite"),
         ({"time_ns": ns(10.0 + FUTURE_LIMIT_S + 0.001)}, "from the future"),
         ({"time_ns": ns(10.0 + FUTURE_LIMIT_S)}, None),
-        ({"time_ns": ns(-3600.0)}, None),
+        ({"time_ns": ns(10.0 - LIMITS.stale_after_s - 0.001)}, "too old on arrival"),
+        ({"time_ns": ns(10.0 - LIMITS.stale_after_s)}, None),
         ({}, None),
     ],
 )
@@ -148,7 +149,7 @@ def test_a_restarted_peer_counts_from_anywhere() -> None:
 @PROPERTY
 @given(st.lists(st.tuples(st.integers(2, 5), st.floats(0.0, 30.0)), min_size=1, max_size=30))
 def test_the_newest_sample_stays_whatever_the_order_of_arrival(arrivals: list[tuple[int, float]]) -> None:
-    t = table()
+    t = table(stale_after_s=60.0)
     for k, (vehicle, seconds) in enumerate(arrivals):
         other = 2 if vehicle != 2 else 3
         t.accept(message(sample(t, other, 0.0), k, digest=(sample(t, vehicle, seconds),)), at(30.0))
@@ -245,15 +246,83 @@ def test_a_climbing_peer_stays_over_its_spot_and_comes_to_rest() -> None:
     t = table()
     up = sample(t, 2, 0.0, Phase.CLIMBING, position_ned_m=Ned(5.0, 6.0, -3.0), velocity_ned_m_s=Ned(0.3, 0.0, -1.5))
     t.accept(message(up), at(0.0))
-    n = predicted(t, 30.0)[2]
-    assert n.position_ned_m == pytest.approx((5.0, 6.0, -6.0), abs=1e-5)
-    assert n.velocity_ned_m_s == pytest.approx((0.0, 0.0, 0.0), abs=1e-5)
+    n = predicted(t, 11.9)[2]
+    assert n.position_ned_m == pytest.approx((5.0, 6.0, -6.0), abs=0.01)
+    assert n.velocity_ned_m_s == pytest.approx((0.0, 0.0, 0.0), abs=0.01)
     assert not n.in_formation
     assert not n.shares_avoidance
     assert n.other_end_ned_m is None
 
 
-@pytest.mark.parametrize("phase", [Phase.IDLE, Phase.LANDED, Phase.RELEASED])
+def test_a_silent_peer_that_climbed_or_landed_is_somewhere_in_its_column() -> None:
+    for phase, end in ((Phase.CLIMBING, -10.0), (Phase.LANDING, 0.0)):
+        t = table()
+        t.accept(message(sample(t, 2, 0.0, phase, position_ned_m=Ned(5.0, 6.0, -3.0))), at(0.0))
+        assert predicted(t, 11.9)[2].other_end_ned_m is None
+        n = predicted(t, 12.5)[2]
+        assert n.position_ned_m == Ned(5.0, 6.0, end)
+        assert n.other_end_ned_m == Ned(5.0, 6.0, -3.0)
+        assert n.uncertainty_m > LIMITS.uncertainty_m
+
+
+@pytest.mark.parametrize("phase", [Phase.RELEASED, Phase.APART, Phase.IDLE])
+def test_a_peer_that_follows_no_plan_is_predicted_by_its_own_velocity_which_fades(phase: Phase) -> None:
+    t = table()
+    v = Ned(1.0, -0.5, 0.2)
+    t.accept(message(sample(t, 2, 0.0, phase, position_ned_m=Ned(5.0, 6.0, -3.0), velocity_ned_m_s=v)), at(0.0))
+    n = predicted(t, 0.1)[2]
+    assert n.position_ned_m == pytest.approx((5.1, 5.95, -2.98), abs=0.01)
+    assert n.velocity_ned_m_s == pytest.approx(v, rel=0.06)
+    assert predicted(t, 11.0)[2].position_ned_m == pytest.approx((7.0, 5.0, -2.6), abs=0.02)
+    assert not n.in_formation
+    assert not n.shares_avoidance
+
+
+# -- peers that cannot be right --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("shift_m", "faster_m_s", "lies"), [(1.4, 0.0, False), (1.8, 0.0, True), (0.0, 4.9, False), (0.0, 5.2, True)]
+)
+def test_a_peer_whose_state_no_motion_explains_is_kept_away_from_for_a_while(
+    shift_m: float, faster_m_s: float, lies: bool
+) -> None:
+    # Half a second at 8 m/s^2 explains 1 m and 4 m/s; one of each is the margin. The plan's own motion is 0.5 m.
+    t = table()
+    t.accept(message(sample(t, 2, 1.0), 1), at(1.0))
+    s = sample(t, 2, 1.5)
+    p, v = s.position_ned_m, s.velocity_ned_m_s
+    s = s._replace(position_ned_m=p._replace(east=p.east + shift_m + 0.3 * (shift_m > 0)),
+                   velocity_ned_m_s=v._replace(east=v.east + faster_m_s))  # fmt: skip
+    t.accept(message(s, 2), at(1.5))
+    n = predicted(t, 1.6)[2]
+    assert n.in_formation is n.shares_avoidance is not lies
+    assert t.rejected == ({"a peer's state jumps": 1} if lies else {})
+    assert predicted(t, 6.4)[2].in_formation is not lies
+    assert predicted(t, 6.6)[2].in_formation
+
+
+def test_a_peer_that_moves_without_changing_its_position_is_not_used() -> None:
+    t = table()
+    first = sample(t, 2, 1.0)
+    for k, seconds in enumerate((1.0, 1.2, 1.4)):
+        t.accept(message(first._replace(time_ns=ns(seconds)), k), at(seconds))
+    assert predicted(t, 1.4)[2].in_formation
+    t.accept(message(first._replace(time_ns=ns(1.5)), 9), at(1.5))
+    assert not predicted(t, 1.5)[2].in_formation
+    assert t.rejected == {"a peer's position frozen": 1}
+
+
+def test_a_peer_that_stands_still_is_healthy() -> None:
+    t = table()
+    first = sample(t, 2, 1.0, velocity_ned_m_s=ZERO)
+    for k in range(9):
+        t.accept(message(first._replace(time_ns=ns(1.0 + k)), k), at(1.0 + k))
+    assert predicted(t, 9.0)[2].in_formation
+    assert t.rejected == {}
+
+
+@pytest.mark.parametrize("phase", [Phase.PREFLIGHT, Phase.LANDED])
 def test_a_peer_that_is_not_ours_to_move_is_where_it_was(phase: Phase) -> None:
     t = table()
     t.accept(message(sample(t, 2, 0.0, phase)), at(0.0))
@@ -466,7 +535,7 @@ def test_a_lost_peer_is_a_neighbour_beside_the_middle_of_its_line(beside_m: floa
     assert len(t.predict(ego, now, t.programme.newest.moment(now.fleet_ns), False)) == heard
 
 
-@pytest.mark.parametrize("phase", [Phase.LANDED, Phase.LANDING, Phase.RELEASED, Phase.CLIMBING])
+@pytest.mark.parametrize("phase", [Phase.LANDED, Phase.PREFLIGHT, Phase.IDLE])
 def test_a_lost_peer_that_was_not_in_formation_has_one_place(phase: Phase) -> None:
     t = table()
     t.accept(message(sample(t, 2, 0.0, phase, velocity_ned_m_s=ZERO)), at(0.0))
@@ -483,10 +552,13 @@ def lost_by_presence() -> PeerTable:
     return t
 
 
-def test_a_lost_peer_comes_back_with_its_presence_or_a_new_message() -> None:
+def test_a_lost_peer_comes_back_with_a_new_message_and_not_by_its_presence_alone() -> None:
     t = lost_by_presence()
     t.presence(2, True, at(7.0))
-    assert predicted(t, 7.0)[2].in_formation
+    assert not predicted(t, 7.0)[2].in_formation
+    assert t.phases()[2] is None
+    t.accept(message(sample(t, 2, 7.5), 2), at(7.5))
+    assert predicted(t, 7.5)[2].in_formation
     t = lost_by_presence()
     t.accept(message(sample(t, 2, 7.0), 2), at(7.0))
     assert predicted(t, 7.0)[2].in_formation

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import inf, pi, radians
 from pathlib import Path
 
@@ -10,7 +10,7 @@ import pytest
 
 from companion.config import FleetConfig, load
 from companion.core.frames import Ned
-from companion.core.plan import GotoLeg, Motion, TurnLeg, VelocityLeg, with_formation, with_legs
+from companion.core.plan import GotoLeg, Motion, TurnLeg, VelocityLeg, over_the_pads, with_formation, with_legs
 from companion.errors import ConfigError, RefusedError
 from companion.operate import (
     CLOCK_ROUNDS_LEAST,
@@ -42,6 +42,7 @@ class Fleet:
     motions: dict[int, Motion | None]
     """None: silent"""
     refusals: dict[int, str] = field(default_factory=dict)
+    obeyed: dict[int, list[object]] = field(default_factory=dict)
     came: list[tuple[int, str, bytes]] = field(default_factory=list)
     checks: dict[int, tuple[Check, ...]] = field(default_factory=dict)
     """vehicle id -> the rows of its own preflight"""
@@ -61,7 +62,8 @@ class Fleet:
             elif kind == "preflight":
                 answers[i] = self.account(i)
             elif kind == "status":
-                answers[i] = json.dumps({"vehicle": i, "motion": json.loads(encode_motion(motion))}).encode()
+                told = {"vehicle": i, "motion": json.loads(encode_motion(motion)), "command": self.obeyed.get(i)}
+                answers[i] = json.dumps(told).encode()
             else:
                 reason = self.refusals.get(i)
                 answers[i] = json.dumps({"vehicle": i, "accepted": reason is None, "reason": reason}).encode()
@@ -183,8 +185,8 @@ def test_hold_stops_the_centre_and_move_sends_it_on() -> None:
     late = held.moment(NOW_NS + 30_000_000_000).centre
     assert late.velocity == (0.0, 0.0, 0.0)
     link = fleet(held)
-    Operator(CONFIG, link).move(velocity_leg(0.0, 1.0, 0.5), NOW_NS)
-    assert link.motion().moment(NOW_NS + 60_000_000_000).centre.velocity == pytest.approx((0.0, 1.0, -0.5))
+    Operator(CONFIG, link).move(velocity_leg(0.0, 1.0, 0.0), NOW_NS)
+    assert link.motion().moment(NOW_NS + 60_000_000_000).centre.velocity == pytest.approx((0.0, 1.0, 0.0))
 
 
 def test_goto_flies_the_centre_to_the_point_and_stops_there() -> None:
@@ -255,3 +257,64 @@ def test_a_vehicle_whose_plan_cannot_be_read_is_named() -> None:
 
     with pytest.raises(RefusedError, match="vehicle 1 tells a plan that cannot be read"):
         Operator(CONFIG, Strange({})).hold(NOW_NS)
+
+
+def test_a_climb_for_ever_is_not_sent() -> None:
+    link = fleet()
+    with pytest.raises(RefusedError, match="climb or sink for ever"):
+        Operator(CONFIG, link).move(velocity_leg(0.0, 0.0, 0.5), NOW_NS)
+    assert link.commands() == []
+
+
+def test_a_command_is_newer_than_the_last_that_any_vehicle_obeyed_and_than_ones_own() -> None:
+    link = fleet()
+    link.obeyed[3] = [41, "somebody"]
+    operator = Operator(CONFIG, link, issuer="me")
+    operator.land()
+    operator.land()
+    orders = [json.loads(p) for p in link.commands()]
+    assert [(o["revision"], o["issuer"]) for o in orders] == [(42, "me")] * 4 + [(43, "me")] * 4
+
+
+def test_two_operators_are_two_issuers() -> None:
+    assert Operator(CONFIG, fleet()).issuer != Operator(CONFIG, fleet()).issuer
+
+
+@pytest.mark.parametrize("verb", ["land", "release", "resume", "kill"])
+def test_a_verb_for_one_vehicle_reaches_that_one_alone(verb: str) -> None:
+    link = fleet()
+    assert getattr(Operator(CONFIG, link), verb)(2).accepted == (2,)
+    assert [i for i, kind, _ in link.came if kind == "command"] == [2]
+    (order,) = (json.loads(p) for p in link.commands())
+    assert order.get("confirm") is (True if verb == "kill" else None)
+    with pytest.raises(ConfigError, match="vehicle 9"):
+        getattr(Operator(CONFIG, link), verb)(9)
+
+
+def test_rtl_brings_every_vehicle_over_its_own_pad() -> None:
+    moving = with_legs(
+        formed(), at_ns=NOW_NS - 10_000_000_000, issuer=1, legs=(TurnLeg(radians(6.0), inf),),
+        heading_follows_turns=True,
+    )  # fmt: skip
+    moving = with_legs(
+        with_legs(moving, at_ns=NOW_NS - 9_000_000_000, issuer=1, legs=(VelocityLeg(Ned(1.0, 0.0, 0.0), 0.0),)),
+        at_ns=NOW_NS - 4_000_000_000, issuer=1, legs=(TurnLeg(radians(6.0), inf),),
+    )  # fmt: skip
+    link = fleet(moving)
+    assert Operator(CONFIG, link).rtl(NOW_NS).all_accepted
+    motion = link.motion()
+    assert motion.returns
+    assert motion.end_ns is not None
+    home = CONFIG.first_motion
+    for i in motion.slots:
+        end = motion.reference(i, motion.end_ns)
+        assert end.position_ned_m == pytest.approx(home.reference(i, 0).position_ned_m, abs=1e-3)
+        assert end.velocity_ned_m_s == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+        start, before = (m.reference(i, motion.start_ns) for m in (motion, moving))
+        assert start.position_ned_m == pytest.approx(before.position_ned_m, abs=1e-6)
+        assert start.velocity_ned_m_s == pytest.approx(before.velocity_ned_m_s, abs=1e-6)
+    assert over_the_pads(motion, home)
+    shifted = replace(motion, legs=(GotoLeg(Ned(5.0, 0.0, -10.0), 20.0),))
+    assert not over_the_pads(shifted, home)
+    swapped = replace(motion, slots={**motion.slots, 1: motion.slots[2], 2: motion.slots[1]})
+    assert not over_the_pads(swapped, home)

@@ -1,0 +1,192 @@
+"""The failsafes: one table of what may fail, when it is noticed, what a vehicle does, and how that is left again.
+
+The flight acts by this table, `docs/failsafes.md` shows it, and the tests inject each row's fault.
+"""
+
+from enum import Enum, unique
+from typing import NamedTuple
+
+
+@unique
+class Action(Enum):
+    """What a vehicle does when something fails."""
+
+    CONTINUE = "continue"
+    HOLD = "hold"
+    """stand by itself, apart from the formation"""
+    LAND = "land"
+    """the autopilot's AUTO.LAND, where the vehicle is"""
+    RETURN = "return"
+    """the whole fleet flies back over its pads and lands there"""
+    HAND_OVER = "hand over"
+    """no setpoint any more: pilot or autopilot have the vehicle"""
+
+
+@unique
+class Failsafe(Enum):
+    """What may fail."""
+
+    POSITION_STALE = "own position stale"
+    POSITION_FROZEN = "own position frozen"
+    POSITION_LOST = "own position lost"
+    POSITION_JUMPED = "own position jumped"
+    POSITION_JUMPS = "own position goes on jumping"
+    COVARIANCE = "own position uncertain"
+    HEARTBEAT = "autopilot's heartbeat lost"
+    PILOT = "OFFBOARD left by the pilot"
+    AUTOPILOT = "OFFBOARD left by the autopilot's failsafe"
+    NOT_ARMED = "autopilot does not arm"
+    NO_TAKE_OFF = "autopilot does not take off"
+    ALTITUDE = "altitude not reached"
+    MISSING = "the others never come"
+    ALONE = "all peers lost"
+    ALONE_FOR_LONG = "all peers lost for long"
+    APART_FOR_LONG = "no way back to the formation"
+    PEER_GONE = "a peer's companion ends"
+    PEER_SILENT = "a peer falls silent"
+    PEER_FROZEN = "a peer's position frozen"
+    PEER_LIES = "a peer's state jumps"
+    PEER_CLOCK = "a peer's clock off"
+    BATTERY_LOW = "battery low"
+    BATTERY_CRITICAL = "battery critical"
+    LOOP_LATE = "control loop late"
+    DISK_FULL = "disk full"
+    CONFIGURATION = "configuration changed on disk"
+    KILLED = "own companion killed"
+    STOPPED = "own companion asked to end"
+    OPERATOR = "operator lost"
+    NOT_FINITE = "a number not finite, a message malformed"
+
+
+class Row(NamedTuple):
+    """One failsafe."""
+
+    noticed: str
+    """after how long; `keys` are those of fleet.toml"""
+    limit_s: float | None
+    """the same as a number where it is a constant (s); detection may take a control period and a message more"""
+    action: Action
+    more: str
+    """what else is done, or why so"""
+    left: str
+
+
+STALE_S = 0.5
+FROZEN_S = 0.5
+LOST_S = 1.5
+"""the autopilot acts COM_OF_LOSS_T (1 s) after the last setpoint, which was made from a position STALE_S old"""
+HEARTBEAT_S = 3.0
+UNCERTAIN_S = 2.0
+"""ESTIMATOR_STATUS comes once a second: two in a row"""
+BATTERY_S = 3.0
+JUMPS_S = 10.0
+LATE_S = 0.2
+CLIMB_S = 60.0
+TAKE_OFF_S = 10.0
+MODE_S = 0.1
+DAMAGE_M = 0.5
+DAMAGE_M_S = 0.5
+LISTEN_S = 3.0
+"""a vehicle that is apart listens this long before it comes back"""
+SUSPECT_S = 5.0
+"""a peer that lied is trusted again after so long without another lie"""
+CONFIGURATION_S = 5.0
+
+_BY_COMMAND = "`fleet resume`; or after landing and disarming, by a new take-off command"
+_NOT = "-"
+
+FAILSAFES: dict[Failsafe, Row] = {
+    Failsafe.POSITION_STALE: Row(
+        "0.5 s", STALE_S, Action.HAND_OVER, "no setpoint; the autopilot's failsafe acts COM_OF_LOSS_T later",
+        "a position comes before that",
+    ),
+    Failsafe.POSITION_FROZEN: Row(
+        "0.5 s without a change at more than 0.1 m/s", FROZEN_S, Action.HAND_OVER, "as stale", "it changes before that",
+    ),
+    Failsafe.POSITION_LOST: Row(
+        "1.5 s stale or frozen", LOST_S, Action.HAND_OVER,
+        "released, and the peers are told: they keep all the distance",
+        _BY_COMMAND,
+    ),
+    Failsafe.POSITION_JUMPED: Row(
+        "the first position 0.5 m or 0.5 m/s beyond what the motion explains (10 sigma of `limits.*_noise_*` if more)",
+        0.0, Action.HOLD, "where it now believes to be; the estimator's origin is asked for again",
+        "3 s after the last jump it comes back to its slot",
+    ),
+    Failsafe.POSITION_JUMPS: Row("10 s of jumps", JUMPS_S, Action.LAND, "", _NOT),
+    Failsafe.COVARIANCE: Row(
+        "2 s of ESTIMATOR_STATUS with flags missing or an accuracy worse than 3 m", UNCERTAIN_S, Action.LAND,
+        "the estimate may drift towards the others", _NOT,
+    ),
+    Failsafe.HEARTBEAT: Row("3 s", HEARTBEAT_S, Action.HAND_OVER, "released", _BY_COMMAND),
+    Failsafe.PILOT: Row(
+        "the next CURRENT_MODE (20 Hz) or HEARTBEAT", MODE_S, Action.HAND_OVER,
+        "released: the stream stops for good, since PX4 returns to OFFBOARD by itself when it resumes", _BY_COMMAND,
+    ),
+    Failsafe.AUTOPILOT: Row(
+        "the next CURRENT_MODE (20 Hz) or HEARTBEAT", MODE_S, Action.HAND_OVER, "the same", _BY_COMMAND,
+    ),
+    Failsafe.NOT_ARMED: Row("10 s", TAKE_OFF_S, Action.CONTINUE, "the take-off is given up, on the ground", "take-off"),
+    Failsafe.NO_TAKE_OFF: Row("10 s armed", TAKE_OFF_S, Action.LAND, "", _NOT),
+    Failsafe.ALTITUDE: Row("60 s of climb", CLIMB_S, Action.LAND, "", _NOT),
+    Failsafe.MISSING: Row(
+        "`peers.wait_s` after reaching altitude", None, Action.LAND,
+        '`peers.missing = "continue"`: those that are up form without them', _NOT,
+    ),
+    Failsafe.ALONE: Row(
+        "`peers.isolated_flight_s` after the last one ended or was silent for 2.1 `trigger.t_max_s`", None, Action.HOLD,
+        "", "a peer is heard: it comes back to its slot",
+    ),
+    Failsafe.ALONE_FOR_LONG: Row("`failsafe.isolated_hold_s` of that hold", None, Action.LAND, "", _NOT),
+    Failsafe.APART_FOR_LONG: Row("`peers.wait_s` apart", None, Action.LAND, "no plan was told, say", _NOT),
+    Failsafe.PEER_GONE: Row(
+        "milliseconds when the process ends, the lease (4 s) when its machine or radio does", None, Action.CONTINUE,
+        "all the distance is kept to everywhere it may be: flown on with the plan, or stopped", "it is heard again",
+    ),
+    Failsafe.PEER_SILENT: Row("2.1 `trigger.t_max_s`", None, Action.CONTINUE, "the same", "it is heard again"),
+    Failsafe.PEER_FROZEN: Row(
+        "its samples repeat a position for 0.5 s at more than 0.1 m/s", FROZEN_S, Action.CONTINUE,
+        "not used in the formation, all the distance is kept to it, counted", "5 s without another",
+    ),
+    Failsafe.PEER_LIES: Row(
+        "the first sample beyond what 8 m/s2 and 1 m (1 m/s) explain", 0.0, Action.CONTINUE, "the same",
+        "5 s without another",
+    ),
+    Failsafe.PEER_CLOCK: Row(
+        "a sample from more than 1 s ahead, or older on arrival than 2.1 `trigger.t_max_s`", 0.0, Action.CONTINUE,
+        "refused and counted; then it is silent", "its clock is right",
+    ),
+    Failsafe.BATTERY_LOW: Row(
+        "3 s below `failsafe.battery_low_percent`", BATTERY_S, Action.RETURN,
+        "with `failsafe.battery_low`: return, land or continue; land where there is no formation yet", _NOT,
+    ),
+    Failsafe.BATTERY_CRITICAL: Row("3 s below `failsafe.battery_critical_percent`", BATTERY_S, Action.LAND, "", _NOT),
+    Failsafe.LOOP_LATE: Row(
+        "0.2 s between two control ticks", LATE_S, Action.CONTINUE,
+        "counted; from COM_OF_LOSS_T on the autopilot's failsafe acts", "the next tick",
+    ),
+    Failsafe.DISK_FULL: Row("the first write that fails", None, Action.CONTINUE, "losses are counted", "there is room"),
+    Failsafe.CONFIGURATION: Row(
+        "5 s", None, Action.CONTINUE, "noted; the vehicle flies on what it was started with", "a new start",
+    ),
+    Failsafe.KILLED: Row(
+        "the autopilot's COM_OF_LOSS_T (1.0 s)", 1.0, Action.HAND_OVER,
+        "the autopilot's COM_OBL_RC_ACT; launchers set 4, land; one that starts in flight steers only on command",
+        "`fleet resume`",
+    ),
+    Failsafe.STOPPED: Row(
+        "SIGTERM, SIGINT, the launcher's end: at once", 0.0, Action.LAND,
+        "it ends once the autopilot confirms (3 s, or 1.2 s without a launcher)", _NOT,
+    ),
+    Failsafe.OPERATOR: Row("not at all", None, Action.CONTINUE, "nothing in flight needs the operator", _NOT),
+    Failsafe.NOT_FINITE: Row("at once", 0.0, Action.CONTINUE, "refused and counted; never in a setpoint", _NOT),
+}  # fmt: skip
+
+
+def table() -> str:
+    """The rows as the table of the docs, in Markdown."""
+    lines = ["| what fails | noticed after | action | how it is left |", "|---|---|---|---|"]
+    for failsafe, row in FAILSAFES.items():
+        action = f"{row.action.value}: {row.more}" if row.more else row.action.value
+        lines.append(f"| {failsafe.value} | {row.noticed} | {action} | {row.left} |")
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,584 @@
+"""One vehicle's flight: it leads the autopilot from phase to phase, and does what the table of failsafes says.
+
+No I/O and no peers' bytes: `agent` asks it at each control tick where to be (`follow`), whether to steer (`steers`),
+and passes the operator's commands on. Phases are `core.phase`'s, failsafes `core.failsafe`'s.
+"""
+
+from collections import Counter
+from dataclasses import dataclass, field
+from math import dist, hypot
+
+from companion.autopilot import AutopilotClient
+from companion.config import FleetConfig
+from companion.core.failsafe import (
+    BATTERY_S,
+    CLIMB_S,
+    FAILSAFES,
+    FROZEN_S,
+    HEARTBEAT_S,
+    JUMPS_S,
+    LISTEN_S,
+    LOST_S,
+    TAKE_OFF_S,
+    UNCERTAIN_S,
+    Action,
+    Failsafe,
+)
+from companion.core.health import Persistence, PositionWatch
+from companion.core.neighbours import PeerTable
+from companion.core.phase import PhaseEvent, next_phase
+from companion.core.plan import Programme, Reference
+from companion.core.rejoin import OwnWay
+from companion.core.safety import SafetyFilter
+from companion.core.values import (
+    FILTERED_PHASES,
+    FLYING_PHASES,
+    FORMATION_PHASES,
+    SETTLED_PHASES,
+    ZERO,
+    Instant,
+    Phase,
+    VehicleState,
+)
+from companion.preflight import ACCURACY_LIMIT_M
+from companion.wire import mavlink as wire
+from companion.wire.mavlink import Px4Mode, mode_name
+
+SETTLED_TOLERANCE_M = 0.6
+SETTLED_FOR_NS = 1_000_000_000
+RETURNED_LIMIT_NS = 15_000_000_000
+"""whoever is not over its pad so long after the way back has ended lands where it is"""
+ALTITUDE_TOLERANCE_M = 0.4
+HOLD_MARGIN_M = 1.0
+"""hold mode this far below the take-off's altitude is the pilot's doing, not the take-off's end"""
+OUR_MODES = frozenset({Px4Mode.AUTO_TAKEOFF, Px4Mode.AUTO_LOITER, Px4Mode.OFFBOARD})
+"""modes in which a vehicle may be while we fly it, but for landing"""
+STREAM_BEFORE_NS = 200_000_000
+"""setpoints are streamed so long before OFFBOARD is asked for"""
+SLOT_JUMP_M = 1.0
+"""a slot that is suddenly so far from where it was is not followed there at once"""
+ENGAGED_AWAY_M = 3.0
+"""whoever engages so far from its slot comes to it by a way of its own"""
+RESUME_LIMIT_NS = 5_000_000_000
+RELEASE_LIMIT_NS = 4_000_000_000
+KILL_LIMIT_NS = 10_000_000_000
+ON_GROUND = 1
+
+
+@dataclass(slots=True)
+class _Orders:
+    """What was commanded and is not done yet; each with its time (monotonic ns)."""
+
+    resume_ns: int | None = None
+    release_ns: int | None = None
+    kill_ns: int | None = None
+
+
+@dataclass(slots=True)
+class Flight:
+    """Phase, failsafes and what is asked of the autopilot."""
+
+    config: FleetConfig
+    vehicle_id: int
+    autopilot: AutopilotClient
+    programme: Programme
+    peers: PeerTable
+    safety: SafetyFilter
+    phase: Phase = Phase.IDLE
+    failsafes: list[str] = field(default_factory=list)
+    counts: Counter[str] = field(default_factory=Counter)
+    notes: list[str] = field(default_factory=list)
+    """what happened, for the log; emptied by the agent"""
+    return_wanted: bool = False
+    """a failsafe of this vehicle wants the whole fleet back over its pads"""
+    forms_without: bool = False
+    """the wait for the others is over, and those that are up form without them"""
+    behind: bool = False
+    """a peer holds a newer motion than we do"""
+    formation_since_ns: int | None = None
+    phase_since_ns: int = 0
+    positions: PositionWatch = field(init=False)
+    _orders: _Orders = field(default_factory=_Orders)
+    _mode_before: int | None = None
+    """custom_mode at arming, until the take-off: the vehicle may stay in it"""
+    _unpositioned: bool = False
+    _unpositioned_since_ns: int = 0
+    _mode_asked_ns: int = 0
+    _land_seen: bool = False
+    _settled_since_ns: int | None = None
+    _settled_blend_ns: int | None = None
+    """start of the change of formation whose end this vehicle has settled in"""
+    _own: OwnWay = field(default_factory=lambda: OwnWay(ZERO))
+    _apart_since_ns: int = 0
+    _listens_until_ns: int = 0
+    _alone_since_ns: int | None = None
+    _jumps: int = 0
+    _first_jump_ns: int | None = None
+    _last_jump_ns: int = 0
+    _engages: bool = False
+    _slot: tuple[int, Reference] | None = None
+    _reference: Reference | None = None
+    _uncertain: Persistence = field(default_factory=lambda: Persistence(UNCERTAIN_S))
+    _low: Persistence = field(default_factory=lambda: Persistence(BATTERY_S))
+    _critical: Persistence = field(default_factory=lambda: Persistence(BATTERY_S))
+    _low_told: bool = False
+
+    def __post_init__(self) -> None:
+        limits = self.config.limits
+        self.positions = PositionWatch.for_noise(limits.position_noise_m, limits.velocity_noise_m_s)
+
+    # -- what others ask -----------------------------------------------------------------------------------------------
+
+    @property
+    def stopped(self) -> bool:
+        """Whether nothing hangs in the air on this process."""
+        return self.phase not in FLYING_PHASES or (self.phase is Phase.LANDING and self._land_seen)
+
+    @property
+    def steers(self) -> bool:
+        """Whether setpoints are streamed: in formation, before it to be let into OFFBOARD, and until landing begins."""
+        return (
+            self.phase in FILTERED_PHASES
+            or (self.phase is Phase.CLIMBING and self._mode_asked_ns > 0)
+            or (self.phase is Phase.LANDING and not self._land_seen and self.autopilot.custom_mode == Px4Mode.OFFBOARD)
+            or self._orders.resume_ns is not None
+        )
+
+    @property
+    def alone(self) -> bool:
+        """Whether it flies by itself: the formation does not draw it."""
+        return self.phase is Phase.APART or self._orders.resume_ns is not None
+
+    # -- the operator's commands: each returns why it is refused, or None ----------------------------------------------
+
+    def take_off(self, now: Instant) -> None:
+        """Arm and climb."""
+        self._happened(PhaseEvent.TAKE_OFF, now)
+
+    def land(self, now: Instant) -> str | None:
+        """Land where the vehicle is."""
+        if self.phase is Phase.RELEASED:
+            return "the pilot has the vehicle"
+        if self.phase is Phase.IDLE and self.autopilot.armed and self._in_the_air:
+            return "it flies without this companion: resume first, or take it over"
+        self.autopilot.withdraw("arming", "take-off")
+        self._orders.resume_ns = None
+        self._happened(PhaseEvent.LAND, now)
+        return None
+
+    def release(self, now: Instant) -> str | None:
+        """Give the vehicle to the pilot: no setpoint any more, the autopilot in its hold mode."""
+        self._orders.resume_ns = None
+        if self.phase is Phase.RELEASED:
+            return None
+        if self.phase not in FLYING_PHASES:
+            self._happened(PhaseEvent.GIVEN_AWAY, now)
+            return None
+        self._happened(PhaseEvent.GIVEN_AWAY, now)
+        self._orders.release_ns = now.monotonic_ns
+        return None
+
+    def kill(self, now: Instant) -> str | None:
+        """Stop the motors at once, wherever the vehicle is."""
+        self._orders.resume_ns = self._orders.release_ns = None
+        self._happened(PhaseEvent.GIVEN_AWAY, now)
+        self.autopilot.cancel()
+        self.autopilot.ask("kill", *wire.kill_parameters())
+        self._orders.kill_ns = now.monotonic_ns
+        self.notes.append("killed by command: the motors are stopped")
+        return None
+
+    def resume(self, now: Instant) -> str | None:
+        """Steer again a vehicle that was released, or that this companion found in the air."""
+        if self.phase in FLYING_PHASES or self._orders.resume_ns is not None:
+            return None
+        if not self.autopilot.armed:
+            return "it is not armed"
+        if not self._in_the_air:
+            return "it is on the ground"
+        if self.autopilot.state(now) is None or self.positions.frozen:
+            return "no position"
+        self._orders.release_ns = self._orders.kill_ns = None
+        self._orders.resume_ns = now.monotonic_ns
+        self.safety.reset()
+        return None
+
+    @property
+    def _in_the_air(self) -> bool:
+        return self.autopilot.landed_state != ON_GROUND
+
+    # -- phases and failsafes ------------------------------------------------------------------------------------------
+
+    def _happened(self, event: PhaseEvent, now: Instant) -> None:
+        before, after = self.phase, next_phase(self.phase, event)
+        if after is before:
+            return
+        ap = self.autopilot
+        self.notes.append(f"{before.name.lower()} -> {after.name.lower()}: {event.value}")
+        self.phase = after
+        self.phase_since_ns = now.monotonic_ns
+        if after is Phase.ARMED:
+            self._mode_before = ap.custom_mode
+        elif before is not Phase.ARMED:
+            self._mode_before = None
+        self._settled_since_ns = None
+        self._mode_asked_ns = 0
+        # A retry of what has happened would happen again: over the pilot's head, at worst.
+        ap.withdraw("arming", "take-off", Px4Mode.OFFBOARD.name)
+        if event in (PhaseEvent.ENGAGED, PhaseEvent.RESUMED):
+            self.safety.reset()
+            self.formation_since_ns = now.fleet_ns
+            self._engages = event is PhaseEvent.ENGAGED
+            self._alone_since_ns = self._first_jump_ns = None
+        if after is Phase.LANDING:
+            self._land_seen = False
+        if after is Phase.RELEASED:
+            ap.cancel()
+        if after not in FLYING_PHASES:
+            self.return_wanted = self.forms_without = self._low_told = False
+
+    def _fail(self, what: Failsafe, now: Instant, detail: str = "", action: Action | None = None) -> None:
+        """Do what the table says, or what the configuration has chosen among the row's ways."""
+        chosen = FAILSAFES[what].action if action is None else action
+        sentence = f"{what.value}: {detail}: {chosen.value}" if detail else f"{what.value}: {chosen.value}"
+        self.failsafes.append(sentence)
+        self.notes.append(f"failsafe: {sentence}")
+        match chosen:
+            case Action.LAND:
+                self._happened(PhaseEvent.LAND, now)
+            case Action.HAND_OVER:
+                self._happened(PhaseEvent.TAKEN_OVER, now)
+            case Action.HOLD:
+                self._stand(now, LISTEN_S)
+            case Action.RETURN:
+                self.return_wanted = True
+
+    def _stand(self, now: Instant, listen_s: float) -> None:
+        """Stand by itself where the vehicle is; it comes back after listening so long."""
+        self._own = OwnWay(self.autopilot.position_ned_m)
+        self._apart_since_ns = now.monotonic_ns
+        self._listens_until_ns = now.monotonic_ns + round(listen_s * 1e9)
+        self._happened(PhaseEvent.STRAYED, now)
+
+    def _taken_over(self, now: Instant) -> None:
+        ap = self.autopilot
+        by_itself = ap.intended_mode is not None and ap.intended_mode != ap.custom_mode
+        self._fail(Failsafe.AUTOPILOT if by_itself else Failsafe.PILOT, now, mode_name(ap.custom_mode))
+
+    # -- at each control tick ------------------------------------------------------------------------------------------
+
+    def watch(self, now: Instant, positioned: bool) -> None:
+        """Lead the autopilot through the flight, and notice when something fails."""
+        ap = self.autopilot
+        self._watch_orders(now)
+        match self.phase:
+            case Phase.PREFLIGHT:
+                self._watch_arming(now)
+            case Phase.ARMED:
+                self._watch_take_off(now)
+            case Phase.CLIMBING:
+                self._watch_climb(now)
+            case Phase.LANDING:
+                self._watch_landing(now)
+            case Phase.RELEASED if not ap.armed:
+                self._happened(PhaseEvent.DISARMED, now)
+            case phase if phase in FILTERED_PHASES:
+                self._watch_flight(now, positioned)
+
+    def _watch_orders(self, now: Instant) -> None:
+        ap, orders = self.autopilot, self._orders
+        if orders.kill_ns is not None:
+            if not ap.armed or now.monotonic_ns - orders.kill_ns > KILL_LIMIT_NS:
+                orders.kill_ns = None
+            else:
+                ap.ask("kill", *wire.kill_parameters())
+        if orders.release_ns is not None:
+            if ap.custom_mode != Px4Mode.AUTO_LOITER and now.monotonic_ns - orders.release_ns <= RELEASE_LIMIT_NS:
+                ap.set_mode(Px4Mode.AUTO_LOITER)
+            else:
+                ap.withdraw(Px4Mode.AUTO_LOITER.name)
+                orders.release_ns = None
+        if orders.resume_ns is not None:
+            waited_ns = now.monotonic_ns - orders.resume_ns
+            if not ap.armed or waited_ns > RESUME_LIMIT_NS:
+                orders.resume_ns = None
+                ap.withdraw(Px4Mode.OFFBOARD.name)
+                self.notes.append(f"resume given up: the autopilot stays in {mode_name(ap.custom_mode)}")
+            elif ap.custom_mode == Px4Mode.OFFBOARD:
+                orders.resume_ns = None
+                self._happened(PhaseEvent.RESUMED, now)
+                self._stand(now, LISTEN_S)
+            elif waited_ns > STREAM_BEFORE_NS:
+                ap.set_mode(Px4Mode.OFFBOARD)
+
+    def _watch_arming(self, now: Instant) -> None:
+        ap = self.autopilot
+        if ap.armed:
+            self._happened(PhaseEvent.ARMED, now)
+        elif now.monotonic_ns - self.phase_since_ns > TAKE_OFF_S * 1e9:
+            self._fail(Failsafe.NOT_ARMED, now, "take-off given up")
+            self._happened(PhaseEvent.GIVEN_UP, now)
+        elif ap.custom_mode == Px4Mode.OFFBOARD:
+            # Left over from a flight before; without setpoints PX4 does not arm in it.
+            ap.set_mode(Px4Mode.AUTO_LOITER)
+        else:
+            ap.ask("arming", *wire.arm_parameters(True))
+
+    def _watch_take_off(self, now: Instant) -> None:
+        ap = self.autopilot
+        if not ap.armed:
+            self._happened(PhaseEvent.DISARMED, now)
+        elif ap.custom_mode == Px4Mode.AUTO_TAKEOFF:
+            self._happened(PhaseEvent.TAKING_OFF, now)
+        elif ap.custom_mode not in OUR_MODES and ap.custom_mode != self._mode_before:
+            self._taken_over(now)
+        elif now.monotonic_ns - self.phase_since_ns > TAKE_OFF_S * 1e9:
+            self._fail(Failsafe.NO_TAKE_OFF, now)
+        else:
+            altitude = self.config.origin.altitude_amsl_m + self.config.formation.altitude_m
+            if self.config.fleet.frame == "local":
+                altitude = float("nan")
+            ap.ask("take-off", *wire.takeoff_parameters(altitude))
+
+    def _watch_climb(self, now: Instant) -> None:
+        ap = self.autopilot
+        if not ap.armed:
+            self._happened(PhaseEvent.DISARMED, now)
+            return
+        if ap.custom_mode == Px4Mode.OFFBOARD:
+            self._happened(PhaseEvent.ENGAGED, now)
+            return
+        if ap.custom_mode not in (Px4Mode.AUTO_TAKEOFF, Px4Mode.AUTO_LOITER):
+            self._taken_over(now)
+            return
+        height = self.config.formation.altitude_m
+        low = self.config.fleet.frame == "global" and -ap.position_ned_m.down < height - HOLD_MARGIN_M
+        if ap.custom_mode == Px4Mode.AUTO_LOITER and low and not self._mode_asked_ns:
+            self._taken_over(now)
+            return
+        reached = -ap.position_ned_m.down > height - ALTITUDE_TOLERANCE_M
+        if self._mode_asked_ns or reached or ap.custom_mode == Px4Mode.AUTO_LOITER:
+            if not self._mode_asked_ns:
+                self._mode_asked_ns = now.monotonic_ns
+                self.safety.reset()
+            elif now.monotonic_ns - self._mode_asked_ns > STREAM_BEFORE_NS:
+                ap.set_mode(Px4Mode.OFFBOARD)
+        if self._critical.holds(self._battery_below(self.config.failsafe.battery_critical_percent), now.monotonic_ns):
+            self._fail(Failsafe.BATTERY_CRITICAL, now, f"{ap.battery_percent} %")
+        elif now.monotonic_ns - self.phase_since_ns > CLIMB_S * 1e9:
+            self._fail(Failsafe.ALTITUDE, now)
+
+    def _watch_landing(self, now: Instant) -> None:
+        ap = self.autopilot
+        if not ap.armed:
+            self._happened(PhaseEvent.DISARMED, now)
+        elif ap.custom_mode == Px4Mode.AUTO_LAND:
+            self._land_seen = True
+        elif self._land_seen:
+            # On disarming PX4 falls back to the mode before, which the heartbeat tells a second later.
+            if ap.custom_mode not in (Px4Mode.OFFBOARD, self._mode_before):
+                self._taken_over(now)
+        elif ap.custom_mode not in OUR_MODES and ap.custom_mode != self._mode_before:
+            self._taken_over(now)
+        else:
+            ap.set_mode(Px4Mode.AUTO_LAND)
+
+    def _watch_flight(self, now: Instant, positioned: bool) -> None:
+        ap = self.autopilot
+        if not ap.armed:
+            self._happened(PhaseEvent.DISARMED, now)
+            return
+        if ap.custom_mode != Px4Mode.OFFBOARD:
+            self._taken_over(now)
+            return
+        if ap.heartbeat_ns is not None and now.monotonic_ns - ap.heartbeat_ns > HEARTBEAT_S * 1e9:
+            self._fail(Failsafe.HEARTBEAT, now)
+            return
+        if not self._watch_position(now, positioned) or self._watch_battery(now):
+            return
+        motion = self.programme.at(now.fleet_ns)
+        lands = motion.then == "land" and not motion.returns
+        if lands and motion.end_ns is not None and now.fleet_ns >= motion.end_ns:
+            self._happened(PhaseEvent.LAND, now)
+            return
+        if self._watch_peers(now):
+            return
+        self._watch_motion(now)
+
+    def _watch_position(self, now: Instant, positioned: bool) -> bool:
+        """Whether the own position is there to steer by."""
+        ap = self.autopilot
+        if not positioned and not self._unpositioned:
+            # No failsafe of ours: positions may come again before the autopilot's own acts, and if it acts, it leaves
+            # OFFBOARD, which is one.
+            what = Failsafe.POSITION_FROZEN if self.positions.frozen else Failsafe.POSITION_STALE
+            self.counts[what.value] += 1
+            self.notes.append(f"{what.value}: no setpoints")
+            self._unpositioned_since_ns = now.monotonic_ns
+        self._unpositioned = not positioned
+        if not positioned:
+            lost = ap.position_age_s(now) > LOST_S
+            frozen_ns = now.monotonic_ns - self._unpositioned_since_ns
+            if lost or frozen_ns > (LOST_S - FROZEN_S) * 1e9:
+                # By now the autopilot's own failsafe has the vehicle, whether or not we can hear it.
+                self._fail(Failsafe.POSITION_LOST, now)
+            return False
+        flags = ap.estimator_flags & ap.flags_needed == ap.flags_needed
+        uncertain = not (flags and ap.horizontal_accuracy_m <= ACCURACY_LIMIT_M)
+        if self._uncertain.holds(uncertain, now.monotonic_ns):
+            self._fail(Failsafe.COVARIANCE, now, f"{ap.horizontal_accuracy_m:.1f} m, flags {ap.estimator_flags:#x}")
+            return False
+        if self.positions.jumps != self._jumps:
+            self._jump(now)
+        return self.phase in FILTERED_PHASES
+
+    def _jump(self, now: Instant) -> None:
+        self._jumps = self.positions.jumps
+        recent = now.monotonic_ns - self._last_jump_ns < LISTEN_S * 1e9
+        self._last_jump_ns = now.monotonic_ns
+        self.counts[Failsafe.POSITION_JUMPED.value] += 1
+        self.autopilot.doubt_origin()
+        self.safety.reset()
+        if self._first_jump_ns is None or not recent:
+            self._first_jump_ns = now.monotonic_ns
+            self._fail(Failsafe.POSITION_JUMPED, now)
+        elif now.monotonic_ns - self._first_jump_ns > JUMPS_S * 1e9:
+            self._fail(Failsafe.POSITION_JUMPS, now)
+        else:
+            self._stand(now, LISTEN_S)
+
+    def _battery_below(self, percent: float) -> bool:
+        return 0 <= self.autopilot.battery_percent < percent
+
+    def _watch_battery(self, now: Instant) -> bool:
+        """Whether the battery ends the flight here and now."""
+        limits = self.config.failsafe
+        percent = f"{self.autopilot.battery_percent} %"
+        if self._critical.holds(self._battery_below(limits.battery_critical_percent), now.monotonic_ns):
+            self._fail(Failsafe.BATTERY_CRITICAL, now, percent)
+            return True
+        if not self._low.holds(self._battery_below(limits.battery_low_percent), now.monotonic_ns) or self._low_told:
+            return False
+        self._low_told = True
+        action = Action(limits.battery_low)
+        if action is Action.RETURN and self.programme.newest.revision == 0:
+            action = Action.LAND
+        self._fail(Failsafe.BATTERY_LOW, now, percent, action)
+        return action is Action.LAND
+
+    def _watch_peers(self, now: Instant) -> bool:
+        """Whether the peers' absence decides what is done."""
+        peers = self.config.peers
+        waited_s = (now.monotonic_ns - self.phase_since_ns) * 1e-9
+        if (
+            self.phase is Phase.WAITING
+            and self.programme.newest.revision == 0
+            and self.config.plan.automatic
+            and waited_s > peers.wait_s
+            and not self.forms_without
+        ):
+            missing = [i for i, phase in self.peers.phases().items() if phase not in FILTERED_PHASES]
+            detail = f"waited for vehicle {', '.join(map(str, missing))} in vain" if missing else "waited in vain"
+            self.forms_without = peers.missing == "continue"
+            self._fail(Failsafe.MISSING, now, detail, Action(peers.missing))
+            return not self.forms_without
+        silent_s = self.peers.silent_for_s(now)
+        if silent_s is None or silent_s <= peers.isolated_flight_s:
+            self._alone_since_ns = None
+            return False
+        if self._alone_since_ns is None:
+            self._alone_since_ns = now.monotonic_ns
+            self._fail(Failsafe.ALONE, now)
+        elif now.monotonic_ns - self._alone_since_ns > self.config.failsafe.isolated_hold_s * 1e9:
+            self._fail(Failsafe.ALONE_FOR_LONG, now)
+        return True
+
+    def _watch_motion(self, now: Instant) -> None:
+        """The phases that follow from what the formation does."""
+        newest, motion = self.programme.newest, self.programme.at(now.fleet_ns)
+        if self.phase is Phase.APART:
+            stands_s = (now.monotonic_ns - self._apart_since_ns) * 1e-9
+            if self._own.start_ns is None and stands_s > self.config.peers.wait_s:
+                self._fail(Failsafe.APART_FOR_LONG, now)
+            return
+        if newest.returns:
+            self._happened(PhaseEvent.RETURN, now)
+            return
+        if newest.revision > 0 and (
+            self.phase in (Phase.WAITING, Phase.RETURNING) or newest.blend_start_ns != self._settled_blend_ns
+        ):
+            self._happened(PhaseEvent.FORM, now)
+        if self.phase in SETTLED_PHASES:
+            match motion.activity(now.fleet_ns):
+                case "legs":
+                    self._happened(PhaseEvent.MOVE, now)
+                case "rest":
+                    self._happened(PhaseEvent.REST, now)
+
+    # -- where to be ---------------------------------------------------------------------------------------------------
+
+    def follow(self, slot: Reference, ego: VehicleState, now: Instant) -> Reference:
+        """The own reference: the slot's, or a way of one's own that never jumps."""
+        before, self._slot = self._slot, (now.fleet_ns, slot)
+        if self._orders.resume_ns is not None:
+            self._reference = Reference(ego.position_ned_m, ZERO, ZERO, slot.heading_rad)
+            return self._reference
+        jumps = before is not None and _apart(*before, slot, now.fleet_ns) > SLOT_JUMP_M
+        if self.phase in FORMATION_PHASES:
+            if self._engages and dist(ego.position_ned_m, slot.position_ned_m) > ENGAGED_AWAY_M:
+                self._stand(now, LISTEN_S)
+            elif jumps and self._reference is not None:
+                self._stand(now, 0.0)
+                self._own.come_back(slot, self._reference, now.fleet_ns, self._speed_m_s)
+            self._engages = False
+        if self.phase is Phase.APART:
+            self._come_back(slot, jumps, now)
+        self._reference = self._own.reference(slot, now.fleet_ns) if self.phase is Phase.APART else slot
+        return self._reference
+
+    @property
+    def _speed_m_s(self) -> float:
+        return self.config.limits.speed_max_m_s / 2
+
+    def _come_back(self, slot: Reference, jumps: bool, now: Instant) -> None:
+        own = self._own
+        if own.start_ns is None:
+            if now.monotonic_ns >= self._listens_until_ns and not self.behind and self._hears_somebody(now):
+                here = own.reference(slot, now.fleet_ns)
+                own.come_back(slot, here, now.fleet_ns, self._speed_m_s)
+        elif jumps and self._reference is not None:
+            own.come_back(slot, self._reference, now.fleet_ns, self._speed_m_s)
+        elif own.over(now.fleet_ns):
+            self._happened(PhaseEvent.REJOINED, now)
+
+    def _hears_somebody(self, now: Instant) -> bool:
+        return not self.peers.ids or self.peers.silent_for_s(now) == 0.0
+
+    def settle(self, ego: VehicleState, reference: Reference, now: Instant) -> None:
+        """Notice that the vehicle has taken its slot, or is back over its pad."""
+        newest = self.programme.newest
+        over_ns = newest.end_ns if self.phase is Phase.RETURNING else newest.blend_end_ns
+        if self.phase not in (Phase.FORMING, Phase.RETURNING) or over_ns is None or now.fleet_ns < over_ns:
+            return
+        if self.programme.at(now.fleet_ns) is not newest:
+            return
+        p, r = ego.position_ned_m, reference.position_ned_m
+        near = hypot(p.north - r.north, p.east - r.east) < SETTLED_TOLERANCE_M and abs(p.down - r.down) < 1.0
+        if not near:
+            self._settled_since_ns = None
+        elif self._settled_since_ns is None:
+            self._settled_since_ns = now.monotonic_ns
+        settled = self._settled_since_ns is not None and now.monotonic_ns - self._settled_since_ns >= SETTLED_FOR_NS
+        if self.phase is Phase.RETURNING and (settled or now.fleet_ns > over_ns + RETURNED_LIMIT_NS):
+            self._happened(PhaseEvent.LAND, now)
+        elif settled:
+            self._settled_blend_ns = newest.blend_start_ns
+            self._happened(PhaseEvent.SETTLED, now)
+
+
+def _apart(then_ns: int, then: Reference, now: Reference, now_ns: int) -> float:
+    """How far a reference is from where the one before leads (m)."""
+    dt_s = min((now_ns - then_ns) * 1e-9, 1.0)
+    p, v = then.position_ned_m, then.velocity_ned_m_s
+    led = (p.north + v.north * dt_s, p.east + v.east * dt_s, p.down + v.down * dt_s)
+    return dist(led, now.position_ned_m)

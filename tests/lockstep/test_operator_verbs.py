@@ -1,0 +1,247 @@
+"""The operator's verbs beyond motions: who obeys, in which order, and what the vehicle then does."""
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from flights import (
+    InLockstep,
+    distances,
+    failsafes,
+    fleet,
+    launch,
+    parse,
+    straight,
+    truth,
+    until,
+    until_formed,
+    until_landed,
+    wait,
+)
+
+from companion.core.plan import VelocityLeg, with_legs
+from companion.core.values import ZERO, Instant, Phase
+from companion.operate import Operator, velocity_leg
+from companion.wire.mavlink import Px4Mode
+from companion.wire.peer import encode_motion
+from sim.lockstep import Lockstep
+
+pytestmark = pytest.mark.timeout(600)
+"""a flight is simulated within a test, on whatever machine"""
+
+
+def stay(tables: dict[str, Any]) -> None:
+    tables["plan"]["then"] = "stay"
+
+
+def wait_for_orders(tables: dict[str, Any]) -> None:
+    tables["plan"]["automatic"] = False
+
+
+def aloft(count: int, record: Any = None) -> tuple[Lockstep, Operator]:
+    """Vehicles that wait over their pads for a formation that nobody orders."""
+    ls = launch(fleet(count, change=wait_for_orders), seed=4, record=record)
+    until(ls, 20.0, lambda: ls.all_in(Phase.WAITING))
+    wait(ls, 1.0)
+    return ls, Operator(ls.config, InLockstep(ls))
+
+
+def order(verb: str, revision: int, issuer: str = "me", **more: object) -> bytes:
+    return json.dumps({"verb": verb, "revision": revision, "issuer": issuer, **more}).encode()
+
+
+def said(ls: Lockstep, payload: bytes, i: int = 1) -> dict[str, Any]:
+    answer: dict[str, Any] = json.loads(ls.command(payload, i)[i])
+    return answer
+
+
+def mode(ls: Lockstep, i: int) -> int:
+    return ls.vehicles[i].autopilot.truth().custom_mode
+
+
+# -- order -----------------------------------------------------------------------------------------------------------
+
+
+def test_an_older_command_is_refused_with_the_reason_and_a_retry_is_answered_alike() -> None:
+    ls, _ = aloft(1)
+    release = order("release", 5)
+    first_answer = ls.command(release, 1)[1]
+    assert json.loads(first_answer)["accepted"]
+    old = said(ls, order("land", 4, "you"))
+    assert not old["accepted"]
+    assert old["reason"] == "command 4 by you is not newer than 5 by me, the last that was obeyed"
+    assert not said(ls, order("land", 5, "m"))["accepted"], "of two with one revision the larger issuer wins"
+    notes = len(ls.notes)
+    wait(ls, 1.0)
+    assert ls.command(release, 1)[1] == first_answer
+    wait(ls, 1.0)
+    assert len(ls.notes) <= notes + 1
+    assert said(ls, order("resume", 5, "you"))["accepted"]
+    assert ls.vehicles[1].agent.status(ls.now)["command"] == [5, "you"]
+
+
+def test_a_refused_command_takes_no_place_in_the_order() -> None:
+    ls, _ = aloft(1)
+    assert not said(ls, order("kill", 9))["accepted"], "without its confirmation"
+    assert said(ls, order("land", 2))["accepted"]
+
+
+@pytest.mark.parametrize(
+    ("payload", "why"),
+    [
+        (b'{"verb":"land"}', "revision must be"), (order("land", 0), "revision must be"),
+        (b'{"verb":"land","revision":true,"issuer":"me"}', "revision must be"),
+        (b'{"verb":"land","revision":1}', "issuer must be"), (order("land", 1, "x" * 65), "issuer must be"),
+        (order("land", 100_000), "more than 10000 ahead"), (order("fly", 1), "unknown verb"),
+    ],
+)  # fmt: skip
+def test_a_command_out_of_all_order_is_refused(payload: bytes, why: str) -> None:
+    agent = Lockstep(fleet(1)).vehicles[1].agent
+    answer = json.loads(agent.receive_command(payload, Instant(1, 1)))
+    assert not answer["accepted"]
+    assert why in answer["reason"]
+
+
+def test_no_motion_may_use_up_the_revisions_of_all_others() -> None:
+    ls, _ = aloft(1)
+    newest = ls.vehicles[1].agent.programme.newest
+    legs = (VelocityLeg(ZERO, 0.0),)
+    motion = with_legs(newest, at_ns=ls.now.fleet_ns, issuer=0, legs=legs)
+    tree = json.loads(encode_motion(motion))
+    answer = said(ls, order("motion", 1, motion={**tree, "revision": 2**32 - 1}))
+    assert "ahead" in answer["reason"]
+    assert said(ls, order("motion", 1, "you", motion=tree))["accepted"]
+
+
+def test_a_motion_that_climbs_for_ever_or_begins_far_away_is_refused() -> None:
+    ls, _ = aloft(1)
+    newest = ls.vehicles[1].agent.programme.newest
+    up = with_legs(newest, at_ns=ls.now.fleet_ns, issuer=0, legs=(velocity_leg(0.0, 0.0, 0.5),))
+    answer = said(ls, order("motion", 1, motion=json.loads(encode_motion(up))))
+    assert answer["reason"] == "it climbs or sinks for ever; give an altitude to go to"
+    tree = json.loads(encode_motion(with_legs(newest, at_ns=ls.now.fleet_ns, issuer=0, legs=(VelocityLeg(ZERO, 0.0),))))
+    tree["centre_ned_m"][0] += 150.0
+    assert "out of range" in said(ls, order("motion", 2, motion=tree))["reason"]
+
+
+# -- rtl -------------------------------------------------------------------------------------------------------------
+
+
+def test_ten_vehicles_fly_back_over_their_own_pads_and_land_there() -> None:
+    ls = launch(fleet(10, change=stay), seed=2)
+    until_formed(ls)
+    operator = Operator(ls.config, InLockstep(ls))
+    assert operator.form("circle", ls.now.fleet_ns).all_accepted
+    assert operator.move(velocity_leg(1.5, 0.5, 0.0), ls.now.fleet_ns).all_accepted
+    wait(ls, 16.0)
+    begun_s = ls.now_ns * 1e-9
+    assert operator.rtl(ls.now.fleet_ns).all_accepted
+    wait(ls, 3.0)
+    assert ls.all_in(Phase.RETURNING)
+    until_landed(ls, 90.0)
+    t = truth(ls, begun_s)
+    assert distances(t).min() >= 1.2
+    for k, i in enumerate(t.ids):
+        v = ls.config.by_id(i)
+        assert np.hypot(*(t.position_ned_m[-1, k, :2] - (v.pad_north_m, v.pad_east_m))) < 1.0
+    assert failsafes(ls) == []
+
+
+def test_a_plan_that_ends_with_its_return_lands_every_vehicle_on_its_pad() -> None:
+    def back(tables: dict[str, Any]) -> None:
+        tables["plan"]["then"] = "return"
+
+    ls = launch(fleet(3, legs=straight(6.0), change=back), seed=3)
+    until_formed(ls)
+    until_landed(ls, 90.0)
+    for i, p in ls.positions().items():
+        v = ls.config.by_id(i)
+        assert np.hypot(p.north - v.pad_north_m, p.east - v.pad_east_m) < 1.0
+    assert failsafes(ls) == []
+
+
+def test_the_rest_form_without_whoever_never_comes_if_that_is_the_rule() -> None:
+    def go_on(tables: dict[str, Any]) -> None:
+        tables["peers"].update(wait_s=5.0, missing="continue")
+
+    ls = launch(fleet(3, legs=straight(4.0), change=go_on), seed=3)
+    ls.command(b'{"verb":"land"}', 2)
+    until(ls, 60.0, lambda: {ls.phases()[i] for i in (1, 3)} == {Phase.MOVING})
+    until(ls, 60.0, lambda: {ls.phases()[i] for i in (1, 3)} == {Phase.LANDED})
+    assert {note for _, note in failsafes(ls)} <= {
+        "failsafe: the others never come: waited for vehicle 2 in vain: continue",
+    }  # fmt: skip
+
+
+# -- release, resume, kill -------------------------------------------------------------------------------------------
+
+
+def test_a_released_vehicle_hovers_without_setpoints_and_comes_back_on_command_without_a_jump() -> None:
+    setpoints: list[tuple[float, bytes]] = []
+
+    def record(i: int, channel: str, now: Instant, body: bytes) -> None:
+        if i == 1 and channel == "output/mavlink" and body[7:10] == b"\x54\x00\x00":
+            setpoints.append((now.monotonic_ns * 1e-9, body))
+
+    ls = launch(fleet(3, change=stay), seed=2, record=record)
+    until_formed(ls)
+    operator = Operator(ls.config, InLockstep(ls))
+    assert operator.move(velocity_leg(1.0, 0.0, 0.0), ls.now.fleet_ns).all_accepted
+    wait(ls, 6.0)
+    released_s = ls.now_ns * 1e-9
+    assert operator.release(1).all_accepted
+    wait(ls, 6.0)
+    assert ls.phases() == {1: Phase.RELEASED, 2: Phase.MOVING, 3: Phase.MOVING}
+    assert setpoints[-1][0] <= released_s + 0.01
+    assert mode(ls, 1) == Px4Mode.AUTO_LOITER
+    resumed_s = ls.now_ns * 1e-9
+    assert operator.resume(1).all_accepted
+    wait(ls, 2.0)
+    assert ls.phases()[1] is Phase.APART
+    until(ls, 60.0, lambda: ls.phases()[1] is Phase.MOVING)
+    t = truth(ls, released_s)
+    assert distances(t).min() >= 1.2
+    velocities = np.array([(m.vx, m.vy) for s, b in setpoints if s > resumed_s for m in [parse(b)]])
+    assert np.linalg.norm(np.diff(velocities, axis=0), axis=1).max() < 0.6
+    assert np.linalg.norm(velocities[0]) < 0.5
+    assert failsafes(ls) == []
+
+
+def test_a_companion_that_starts_in_flight_steers_only_on_command_and_comes_back() -> None:
+    ls, operator = aloft(2)
+    ls.kill(1)
+    wait(ls, 1.5)
+    assert mode(ls, 1) == Px4Mode.AUTO_LAND
+    ls.restart(1)
+    wait(ls, 1.2)
+    assert ls.phases()[1] is Phase.IDLE
+    assert operator.resume(1).all_accepted
+    until(ls, 30.0, lambda: ls.phases()[1] is Phase.WAITING)
+    assert mode(ls, 1) == Px4Mode.OFFBOARD
+    assert operator.land().all_accepted
+    until_landed(ls)
+
+
+def test_on_the_ground_there_is_nothing_to_resume() -> None:
+    ls = Lockstep(fleet(1))
+    ls.run_until(5.0)
+    assert said(ls, order("resume", 1))["reason"] == "it is not armed"
+
+
+def test_a_killed_vehicle_falls_at_once_and_the_others_stay() -> None:
+    ls, operator = aloft(2)
+    assert not said(ls, order("kill", 3))["accepted"]
+    assert operator.kill(1).all_accepted
+    wait(ls, 0.2)
+    assert not ls.vehicles[1].autopilot.truth().armed
+    wait(ls, 2.5)
+    assert ls.positions()[1].down > -0.2
+    assert ls.phases() == {1: Phase.LANDED, 2: Phase.WAITING}
+
+
+def test_one_vehicle_lands_while_the_others_stay() -> None:
+    ls, operator = aloft(2)
+    assert operator.land(2).all_accepted
+    until(ls, 30.0, lambda: ls.phases()[2] is Phase.LANDED)
+    assert ls.phases()[1] is Phase.WAITING
