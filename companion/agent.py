@@ -56,7 +56,7 @@ from companion.preflight import Account, Check, assignment_hash, own_checks, unm
 from companion.wire.mavlink import MavlinkLink, mode_name
 from companion.wire.peer import decode_motion, decode_state, encode_motion, encode_state
 
-TIMER_SLACK = 1.5
+TIMER_SLACK = 2.5
 """without a new position the control tick comes this many periods after the last"""
 PROPOSAL_DELAY_NS = 3_000_000_000
 """how far ahead a vehicle proposes a start that follows by itself"""

@@ -29,7 +29,7 @@ Parameters = Annotated[
 ]
 DEFAULT_FILE = Path("fleet.toml")
 CROWD_PER_CORE = 8
-CROWD_RATE_HZ = 25.0
+CROWD_RATE_HZ = 20.0
 """the control rate of a fleet whose companions share one machine, more than CROWD_PER_CORE to each of its cores"""
 FAULTS = (
     "gps_lost", "position_frozen", "estimator_reset", "noise", "low_battery", "reboot", "mute", "pilot_takeover",

@@ -149,7 +149,10 @@ class PeerTable:
             self.rejected[reason] += 1
             return reason
         for hearsay in message.digest:
-            if hearsay.vehicle_id == self.own_id:
+            known = self._peers.get(hearsay.vehicle_id)
+            if hearsay.vehicle_id == self.own_id or (
+                known is not None and known.sample is not None and hearsay.time_ns <= known.sample.time_ns
+            ):
                 continue
             reason = self._refusal(hearsay, now)
             if reason is None:

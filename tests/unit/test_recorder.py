@@ -225,12 +225,24 @@ def test_a_recording_rewritten_in_chunks_is_refused_and_not_taken_for_empty(tmp_
 
 
 def test_recording_costs_the_control_thread_a_few_microseconds_a_call(tmp_path: Path) -> None:
-    """The bar is 3 us; the test allows for a busy machine, and takes CPU time, which others do not lengthen."""
+    """The bar is 3 us; on whatever machine, it is less than what the mcap package's own writer takes."""
     body = bytes(60)
+
+    def own_time_s() -> float:
+        return resource.getrusage(resource.RUSAGE_THREAD).ru_utime
+
+    with (tmp_path / "b.mcap").open("wb") as file:
+        writer = Writer(file, use_chunking=False)
+        writer.start()
+        channel = writer.register_channel("input/mavlink", "", 0)
+        begin_s = own_time_s()
+        for _ in range(10_000):
+            writer.add_message(channel, NOW.fleet_ns, body, NOW.monotonic_ns)
+        theirs_s = (own_time_s() - begin_s) / 10_000
     with Recorder(tmp_path / "a.mcap", METADATA) as recorder:
-        begin_s = resource.getrusage(resource.RUSAGE_THREAD).ru_utime
+        begin_s = own_time_s()
         for _ in range(30_000):
             recorder.record("input/mavlink", NOW, body)
-        spent_s = resource.getrusage(resource.RUSAGE_THREAD).ru_utime - begin_s
-    assert spent_s / 30_000 < 10e-6
+        spent_s = (own_time_s() - begin_s) / 30_000
+    assert spent_s < theirs_s
     assert recorder.lost == 0
