@@ -268,7 +268,9 @@ def reference_loop(out: Annotated[Path, typer.Option()]) -> None:
 def study(
     name: Annotated[
         str,
-        typer.Argument(help="example1, example2, table3, readings, pareto, faults, scale, theory, or all."),
+        typer.Argument(
+            help="example1, example2, table3, readings, pareto, faults, scale, theory, all; or headon, campaign."
+        ),
     ],
     seeds: Annotated[
         str | None, typer.Option(help="As in 0..19 (the default) or 0,3,5; without it, all takes 20..39.")

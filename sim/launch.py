@@ -218,6 +218,7 @@ def _fly(
         seed=options.seed,
         truth=np.fromfile(truth, TRUTH_DTYPE) if truth.exists() else np.zeros(0, TRUTH_DTYPE),
         takeoff_ns=takeoff_ns,
+        centroid_limit_m=0.5 if options.px4 is None else 1.0,
         lost=lost,
         disarmed={i: not said["armed"] for i, said in final.items()},
         versions={"python": sys.version.split()[0], **{name: version(name) for name in LIBRARIES}},

@@ -10,6 +10,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from companion.errors import CompanionError, ConfigError
 from sim.study.common import (
+    FLOWN_STUDIES,
     STUDIES,
     Config,
     Outcome,
@@ -74,7 +75,7 @@ app = typer.Typer(add_completion=False, help="The paper's results, which reading
 
 @app.command()
 def command(
-    name: Annotated[str, typer.Argument(help=f"one of {', '.join(STUDIES)}, or all")],
+    name: Annotated[str, typer.Argument(help=f"one of {', '.join(STUDIES + FLOWN_STUDIES)}, or all")],
     seeds: Annotated[
         str | None, typer.Option(help="as in 0..19 (the default) or 0,3,5; without it, all takes 20..39")
     ] = None,

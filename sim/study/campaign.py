@@ -1,0 +1,295 @@
+"""Fault campaign: whole flights of ten real agents in lockstep, one to three faults each, drawn by the seed."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import numpy as np
+
+from companion.config import FleetConfig, parse
+from companion.core.values import FLYING_PHASES, Phase
+from companion.errors import ConfigError
+from sim.lockstep import Lockstep
+from sim.network import NetworkParameters
+from sim.px4.faults import Fault, FaultKind
+from sim.study.common import Column, Config, Outcome, Record, Table, proportion_text
+
+TITLE = "Fault campaign: flights with one to three faults each"
+SOURCES = tuple(
+    sorted(p for folder in ("companion", "sim") for p in (Path(__file__).parents[2] / folder).rglob("*.py"))
+)
+"""everything that flies here: finished seeds are run anew when any of it changes"""
+COLLISION_M = 0.5
+ON_GROUND = 1
+READY_S = 60.0
+ESTIMATE_FAULTS = frozenset({"gps_lost", "position_frozen", "estimator_reset", "noise"})
+"""after these a vehicle does not know where it is, and nobody can: distance and fence are not judged for it"""
+LEFT_TO_OTHERS = frozenset(
+    {"reboot", "rc_kill", "pilot_takeover", "pilot_sticks", "mute", "killed", "restarted", "slow_link"}
+)
+"""after these the vehicle is the pilot's or its autopilot's: its path is not judged against the fence"""
+AUTOPILOT_FAULTS = (
+    "gps_lost", "position_frozen", "estimator_reset", "noise", "low_battery", "reboot", "mute", "pilot_takeover",
+    "pilot_sticks", "rc_kill", "slow_link",
+)  # fmt: skip
+FLEET_FAULTS = ("killed", "restarted", "stalled", "partition")
+OF_THE_FLEET = ("all peers lost", "the others never come", "no way back")
+"""failsafes that another's fault explains"""
+
+
+@dataclass(frozen=True, slots=True)
+class Flight:
+    """What is the same in every flight."""
+
+    vehicles: int
+    altitude_m: float
+    seconds: float
+    faults_from_s: float
+    faults_to_s: float
+    most_faults: int
+    loss: float
+    delay_s: float
+    fence_radius_m: float
+    fence_ceiling_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    """One fault of one flight."""
+
+    at_s: float
+    """after the take-off command"""
+    vehicle_id: int
+    """0: the network"""
+    kind: str
+    duration_s: float
+    magnitude: float | None = None
+
+
+def flight_of(config: Config) -> Flight:
+    """The set-up's flight; a missing or unknown key is refused."""
+    given = dict(config.values.get("flight", {}))
+    known = {f.name for f in fields(Flight)}
+    if set(given) != known:
+        wrong = ", ".join(sorted(set(given) ^ known))
+        raise ConfigError(f"campaign.toml: $.flight must have the keys {', '.join(sorted(known))}; wrong: {wrong}")
+    return Flight(**given)
+
+
+def drawn_faults(flight: Flight, seed: int) -> list[Drawn]:
+    """The faults of a seed, in the order of their times."""
+    random = Random(f"campaign/{seed}")
+    faults = []
+    for _ in range(random.randint(1, flight.most_faults)):
+        kind = random.choice((*AUTOPILOT_FAULTS, *FLEET_FAULTS))
+        i = 0 if kind == "partition" else random.randint(1, flight.vehicles)
+        magnitude = {"noise": random.uniform(0.2, 1.0), "low_battery": random.choice((0.05, 0.15))}.get(kind)
+        at_s = random.uniform(flight.faults_from_s, flight.faults_to_s)
+        faults.append(Drawn(at_s, i, kind, random.choice((0.7, 3.0, 10.0, 1000.0)), magnitude))
+    return sorted(faults, key=lambda f: f.at_s)
+
+
+def _fleet(flight: Flight) -> FleetConfig:
+    return parse(
+        {
+            "fleet": {
+                "name": "campaign",
+                "origin": {"latitude_deg": 47.397742, "longitude_deg": 8.545594, "altitude_amsl_m": 488.0},
+            },
+            "formation": {"altitude_m": flight.altitude_m},
+            "plan": {
+                "then": "land",
+                "legs": [
+                    {"kind": "velocity", "north_m_s": 1.0, "duration_s": 6.0},
+                    {"kind": "turn", "rate_deg_s": 9.0, "angle_deg": 45.0},
+                    {"kind": "hold", "duration_s": 1.0},
+                ],
+            },
+            "limits": {"control_rate_hz": 25.0},
+            "peers": {"wait_s": 25.0},
+            "fence": {"radius_m": flight.fence_radius_m, "floor_m": 1.0, "ceiling_m": flight.fence_ceiling_m},
+            "vehicle": [{"id": i} for i in range(1, flight.vehicles + 1)],
+        },
+        "campaign.toml",
+    )
+
+
+def _inject(ls: Lockstep, fault: Drawn, random: Random) -> None:
+    i = fault.vehicle_id
+    match fault.kind:
+        case "killed":
+            if ls.vehicles[i].alive:
+                ls.kill(i)
+        case "restarted":
+            if ls.vehicles[i].alive:
+                ls.kill(i)
+                ls.restart(i)
+        case "stalled":
+            ls.stall(i, min(fault.duration_s, 3.0))
+        case "partition":
+            ids = list(ls.vehicles)
+            random.shuffle(ids)
+            cut = random.randint(1, len(ids) - 1)
+            ls.partition(ids[:cut], ids[cut:])
+        case kind:
+            ls.vehicles[i].autopilot.inject(Fault(FaultKind(kind), fault.magnitude, fault.duration_s))
+
+
+def fly(flight: Flight, seed: int) -> Record:
+    """One flight from take-off to the end of the last vehicle's; what was seen of it."""
+    config = _fleet(flight)
+    ls = Lockstep(config, seed=seed, network=NetworkParameters(delay_s=flight.delay_s, loss=flight.loss))
+    ls.run_until(READY_S, lambda: not any(v.agent.unready(ls.now) for v in ls.vehicles.values()))
+    ls.command(b'{"verb":"takeoff"}')
+    began_s = ls.now_ns * 1e-9
+    random = Random(f"campaign/{seed}/parts")
+    faults = drawn_faults(flight, seed)
+    orders = [(f.at_s, "begin", f) for f in faults]
+    orders += [(f.at_s + f.duration_s, "heal", f) for f in faults if f.kind == "partition"]
+    for at_s, what, fault in sorted(orders, key=lambda o: o[0]):
+        if at_s < flight.seconds:
+            ls.run_until(began_s + at_s)
+            if what == "heal":
+                ls.partition()
+            else:
+                _inject(ls, fault, random)
+    ls.run_until(began_s + flight.seconds, lambda: not _stuck(ls))
+    return {
+        "faults": [[round(f.at_s, 3), f.vehicle_id, f.kind, f.duration_s, f.magnitude] for f in faults],
+        **_distances(ls, faults, began_s),
+        **_breach(ls, faults, flight, began_s),
+        "stuck": _stuck(ls),
+        "unexplained": _unexplained(ls, faults),
+        "failsafes": dict(Counter(n.removeprefix("failsafe: ").split(":")[0] for _, _, n in _failsafes(ls))),
+        "ended_after_s": ls.now_ns * 1e-9 - began_s,
+    }
+
+
+def _stuck(ls: Lockstep) -> list[list[Any]]:
+    """Vehicles in the air that nobody but us has in hand, and companions that still wait to take off."""
+    stuck: list[list[Any]] = []
+    for i, v in ls.vehicles.items():
+        flies = v.autopilot.truth().landed_state != ON_GROUND
+        ours = v.alive and v.agent.phase in FLYING_PHASES | {Phase.PREFLIGHT}
+        orphan = not v.alive and flies
+        if ours or orphan:
+            stuck.append([i, v.agent.phase.name.lower() if v.alive else "companion ended"])
+    return stuck
+
+
+def _failsafes(ls: Lockstep) -> list[tuple[float, int, str]]:
+    return [n for n in ls.notes if n[2].startswith("failsafe")]
+
+
+def _unexplained(ls: Lockstep, faults: Sequence[Drawn]) -> list[list[Any]]:
+    """Failsafes of vehicles that had no fault, beyond those that another's fault explains."""
+    own = {f.vehicle_id for f in faults}
+    return [
+        [round(s, 2), i, text]
+        for s, i, text in _failsafes(ls)
+        if i not in own and not any(reason in text for reason in OF_THE_FLEET)
+    ]
+
+
+def _rows(ls: Lockstep, began_s: float) -> tuple[Any, Any]:
+    rows = ls.truth().reshape(-1, len(ls.vehicles))
+    seconds = (rows["time_unix_ns"][:, 0] - (ls.now.fleet_ns - ls.now_ns)) * 1e-9 - began_s
+    return rows[seconds >= 0.0], seconds[seconds >= 0.0]
+
+
+def _since(ids: Sequence[int], faults: Sequence[Drawn], kinds: frozenset[str]) -> Any:
+    """When each vehicle had its first fault of some kinds (s after the command); infinite without one."""
+    since = np.full(len(ids), np.inf)
+    for f in faults:
+        if f.kind in kinds:
+            k = ids.index(f.vehicle_id)
+            since[k] = min(since[k], f.at_s)
+    return since
+
+
+def _distances(ls: Lockstep, faults: Sequence[Drawn], began_s: float) -> Record:
+    """Least true distances with at least one of the pair in the air: of all, and of those who could know."""
+    rows, seconds = _rows(ls, began_s)
+    p, ids = rows["position_ned_m"], list(ls.vehicles)
+    a, b = np.triu_indices(len(ids), 1)
+    distance = np.linalg.norm(p[:, a] - p[:, b], axis=2)
+    flying = rows["landed_state"] != ON_GROUND
+    distance[~(flying[:, a] | flying[:, b])] = np.inf
+    blind = seconds[:, None] >= _since(ids, faults, ESTIMATE_FAULTS)[None, :]
+    known = np.where(blind[:, a] | blind[:, b], np.inf, distance)
+    at, pair = np.unravel_index(int(known.argmin()), known.shape)
+    return {
+        "minimum_distance_m": float(known.min()),
+        "minimum_of": [round(float(seconds[at]), 2), ids[a[pair]], ids[b[pair]]],
+        "minimum_with_the_blind_m": float(distance.min()),
+    }
+
+
+def _breach(ls: Lockstep, faults: Sequence[Drawn], flight: Flight, began_s: float) -> Record:
+    """The farthest that a vehicle in our hands was beyond the fence (m); negative inside."""
+    rows, seconds = _rows(ls, began_s)
+    ids = list(ls.vehicles)
+    p = rows["position_ned_m"]
+    beyond = np.maximum(np.hypot(p[:, :, 0], p[:, :, 1]) - flight.fence_radius_m, -p[:, :, 2] - flight.fence_ceiling_m)
+    judged = seconds[:, None] < _since(ids, faults, ESTIMATE_FAULTS | LEFT_TO_OTHERS)[None, :]
+    return {"beyond_fence_m": float(np.where(judged, beyond, -np.inf).max())}
+
+
+def piece(config: Config, seed: int) -> Record:
+    """One seed's flight."""
+    return fly(flight_of(config), seed)
+
+
+def finish(config: Config, pieces: Sequence[Record], seeds: Sequence[int]) -> Outcome:
+    """What happened in how many of the flights, with intervals; every flight in which something did, by its seed."""
+    n = len(pieces)
+    judged = {
+        f"collisions (below {COLLISION_M} m, places known)": [p["minimum_distance_m"] < COLLISION_M for p in pieces],
+        "fence breaches": [p["beyond_fence_m"] > 0.0 for p in pieces],
+        "stuck flights": [bool(p["stuck"]) for p in pieces],
+        "flights with an unexplained failsafe": [bool(p["unexplained"]) for p in pieces],
+    }
+    blind = [p["minimum_with_the_blind_m"] < COLLISION_M for p in pieces]
+    rows: list[Record] = [
+        {"what": what, "flights": proportion_text(sum(came), n), "count": sum(came)} for what, came in judged.items()
+    ]
+    rows.append({
+        "what": "below it with a vehicle that had lost its place (not judged)",
+        "flights": proportion_text(sum(blind), n), "count": sum(blind),
+    })  # fmt: skip
+    outcome = Outcome()
+    outcome.tables.append(
+        Table("campaign", f"{n} flights of {flight_of(config).vehicles} vehicles", (
+            Column("what", "what"), Column("flights", "flights"),
+        ), rows, "Real agents on stub autopilots in lockstep; the faults are drawn by the seed.")
+    )  # fmt: skip
+    bad = [
+        {"seed": seed, "minimum_m": p["minimum_distance_m"], "faults": p["faults"], "stuck": p["stuck"],
+         "unexplained": p["unexplained"], "beyond_fence_m": p["beyond_fence_m"], "minimum_of": p["minimum_of"]}
+        for k, (seed, p) in enumerate(zip(seeds, pieces, strict=True))
+        if any(came[k] for came in judged.values())
+    ]  # fmt: skip
+    kinds = Counter(kind for p in pieces for _, _, kind, _, _ in p["faults"])
+    taken = Counter[str]()
+    for p in pieces:
+        taken.update(p["failsafes"])
+    outcome.tables.append(
+        Table("campaign_faults", "What was injected", (Column("kind", "fault"), Column("count", "times", 0)), [
+            {"kind": kind, "count": count} for kind, count in kinds.most_common()
+        ])
+    )  # fmt: skip
+    outcome.tables.append(
+        Table("campaign_failsafes", "What the vehicles did", (
+            Column("failsafe", "failsafe"), Column("count", "times", 0),
+        ), [{"failsafe": name, "count": count} for name, count in taken.most_common()])
+    )  # fmt: skip
+    least = min(p["minimum_distance_m"] for p in pieces)
+    outcome.findings.append(
+        f"{len(bad)} of {n} flights broke a rule; "
+        f"the least distance of vehicles that knew where they were is {least:.2f} m."
+    )
+    outcome.values |= {"rows": rows, "broken": bad, "least_m": least}
+    return outcome
