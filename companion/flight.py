@@ -71,6 +71,8 @@ class _Orders:
 
     resume_ns: int | None = None
     release_ns: int | None = None
+    released_from: int = 0
+    """custom_mode at the release; whoever changes it afterwards has the vehicle"""
     kill_ns: int | None = None
 
 
@@ -175,7 +177,7 @@ class Flight:
             self._happened(PhaseEvent.GIVEN_AWAY, now)
             return None
         self._happened(PhaseEvent.GIVEN_AWAY, now)
-        self._orders.release_ns = now.monotonic_ns
+        self._orders.release_ns, self._orders.released_from = now.monotonic_ns, self.autopilot.custom_mode
         return None
 
     def kill(self, now: Instant) -> str | None:
@@ -293,7 +295,8 @@ class Flight:
             else:
                 ap.ask("kill", *wire.kill_parameters())
         if orders.release_ns is not None:
-            if ap.custom_mode != Px4Mode.AUTO_LOITER and now.monotonic_ns - orders.release_ns <= RELEASE_LIMIT_NS:
+            waits = now.monotonic_ns - orders.release_ns <= RELEASE_LIMIT_NS
+            if ap.custom_mode == orders.released_from != Px4Mode.AUTO_LOITER and waits:
                 ap.set_mode(Px4Mode.AUTO_LOITER)
             else:
                 ap.withdraw(Px4Mode.AUTO_LOITER.name)

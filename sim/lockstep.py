@@ -58,6 +58,8 @@ class Lockstep:
     network: NetworkParameters = field(default_factory=NetworkParameters)
     record: Callable[[int, str, Instant, bytes], None] | None = None
     """called with every input and output of every agent: (vehicle id, channel, time, body)"""
+    command_delay_s: float = 0.0
+    """how much longer than LINK_DELAY_NS what a companion sends takes to its autopilot"""
     now_ns: int = 0
     vehicles: dict[int, Vehicle] = field(init=False)
     sent: list[Sent] = field(default_factory=list)
@@ -182,7 +184,8 @@ class Lockstep:
         for datagram in out.mavlink:
             self._log(i, "output/mavlink", datagram)
         if out.mavlink:
-            self._at(self.now_ns + LINK_DELAY_NS, lambda: self._to_autopilot(i, out.mavlink))
+            arrival_ns = self.now_ns + LINK_DELAY_NS + round(self.command_delay_s * 1e9)
+            self._at(arrival_ns, lambda: self._to_autopilot(i, out.mavlink))
         for topic, payload in out.peers:
             self._log(i, "output/peer", f"{topic}\0".encode() + payload)
             self.sent.append(Sent(self.now_ns, i, topic, len(payload)))
