@@ -273,6 +273,11 @@ class Flight:
         """Lead the autopilot through the flight, and notice when something fails."""
         ap = self.autopilot
         self._watch_orders(now)
+        silent = ap.heartbeat_ns is not None and now.monotonic_ns - ap.heartbeat_ns > HEARTBEAT_S * 1e9
+        if silent and self.phase in FLYING_PHASES:
+            # In whatever phase: a landing of which nobody tells the end would last for ever.
+            self._fail(Failsafe.HEARTBEAT, now)
+            return
         match self.phase:
             case Phase.PREFLIGHT:
                 self._watch_arming(now)
@@ -393,9 +398,6 @@ class Flight:
             return
         if ap.custom_mode != Px4Mode.OFFBOARD:
             self._taken_over(now)
-            return
-        if ap.heartbeat_ns is not None and now.monotonic_ns - ap.heartbeat_ns > HEARTBEAT_S * 1e9:
-            self._fail(Failsafe.HEARTBEAT, now)
             return
         if not self._watch_position(now, positioned) or self._watch_battery(now):
             return

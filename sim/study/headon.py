@@ -94,8 +94,8 @@ def meet(meeting: Meeting, seed: int, *, lag_s: float, delay_s: float, loss: flo
         v.agent.safety = laws[i] = BrokenLaw(config.safety_limits)
     fleet.run_until(READY_S, lambda: not any(v.agent.unready(fleet.now) for v in fleet.vehicles.values()))
     fleet.command(b'{"verb":"takeoff"}')
-    fleet.run_until(fleet.now_ns * 1e-9 + CLIMB_S, lambda: fleet.all_in(Phase.FORMING))
-    if not fleet.all_in(Phase.FORMING):
+    fleet.run_until(fleet.now_ns * 1e-9 + CLIMB_S, lambda: fleet.all_in(Phase.WAITING))
+    if not fleet.all_in(Phase.WAITING):
         raise ConfigError(f"head-on: the two are not in the air {CLIMB_S:g} s after the command: {fleet.notes}")
     start_ns, sent = fleet.now_ns, len(fleet.sent)
     for i, way in ((1, 1.0), (2, -1.0)):

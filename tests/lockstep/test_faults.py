@@ -350,6 +350,14 @@ def test_a_vehicle_whose_autopilot_fell_silent_is_released_and_its_peers_know_an
     assert distances(truth(ls, muted_s)).min() > CLEARANCE_M
 
 
+def test_a_vehicle_whose_autopilot_falls_silent_in_the_climb_is_released_and_not_awaited_for_ever() -> None:
+    ls = launch(fleet(2), seed=4)
+    until(ls, 10.0, lambda: ls.phases()[2] is Phase.CLIMBING)
+    ls.vehicles[2].autopilot.inject(Fault(FaultKind.MUTE))
+    until(ls, 4.5, lambda: ls.phases()[2] is Phase.RELEASED)
+    assert (2, "failsafe: autopilot's heartbeat lost: hand over") in failsafes(ls)
+
+
 def test_another_take_off_after_the_plan_has_landed_is_refused_with_the_reason() -> None:
     ls = launch(fleet(2, legs=straight(2.0)), seed=5)
     until_formed(ls)
