@@ -12,7 +12,8 @@ import numpy as np
 from companion.config import FleetConfig, parse
 from companion.core.values import FLYING_PHASES, Phase
 from companion.errors import ConfigError
-from sim.lockstep import Lockstep
+from companion.wire.mavlink import Px4Mode
+from sim.lockstep import Lockstep, Vehicle
 from sim.network import NetworkParameters
 from sim.px4.faults import Fault, FaultKind
 from sim.study.common import Column, Config, Outcome, Record, Table, proportion_text
@@ -162,6 +163,7 @@ def fly(flight: Flight, seed: int) -> Record:
         **_distances(ls, faults, began_s),
         **_breach(ls, faults, flight, began_s),
         "stuck": _stuck(ls),
+        "left_in_hold": [i for i, v in ls.vehicles.items() if _orphan(v)],
         "unexplained": _unexplained(ls, faults),
         "failsafes": dict(Counter(n.removeprefix("failsafe: ").split(":")[0] for _, _, n in _failsafes(ls))),
         "ended_after_s": ls.now_ns * 1e-9 - began_s,
@@ -169,15 +171,20 @@ def fly(flight: Flight, seed: int) -> Record:
 
 
 def _stuck(ls: Lockstep) -> list[list[Any]]:
-    """Vehicles in the air that nobody but us has in hand, and companions that still wait to take off."""
+    """Vehicles in the air that nobody but us has in hand, and companions that still wait to take off.
+
+    A companion that ends in the climb leaves its vehicle in the autopilot's hold: that is handed over, and counted.
+    """
     stuck: list[list[Any]] = []
     for i, v in ls.vehicles.items():
-        flies = v.autopilot.truth().landed_state != ON_GROUND
         ours = v.alive and v.agent.phase in FLYING_PHASES | {Phase.PREFLIGHT}
-        orphan = not v.alive and flies
-        if ours or orphan:
+        if ours or (_orphan(v) and v.autopilot.truth().custom_mode != Px4Mode.AUTO_LOITER):
             stuck.append([i, v.agent.phase.name.lower() if v.alive else "companion ended"])
     return stuck
+
+
+def _orphan(v: Vehicle) -> bool:
+    return not v.alive and v.autopilot.truth().landed_state != ON_GROUND
 
 
 def _failsafes(ls: Lockstep) -> list[tuple[float, int, str]]:
@@ -259,6 +266,11 @@ def finish(config: Config, pieces: Sequence[Record], seeds: Sequence[int]) -> Ou
     rows.append({
         "what": "below it with a vehicle that had lost its place (not judged)",
         "flights": proportion_text(sum(blind), n), "count": sum(blind),
+    })  # fmt: skip
+    held = [bool(p["left_in_hold"]) for p in pieces]
+    rows.append({
+        "what": "a companion killed in the climb left its vehicle in the autopilot's hold (not judged)",
+        "flights": proportion_text(sum(held), n), "count": sum(held),
     })  # fmt: skip
     outcome = Outcome()
     outcome.tables.append(

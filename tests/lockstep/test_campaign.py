@@ -1,4 +1,4 @@
-"""Twenty flights of the fault campaign; `fleet study campaign --seeds 0..499 --jobs 2` flies the whole."""
+"""Twenty flights of the fault campaign with six vehicles; `fleet study campaign --seeds 0..499 --jobs 2` flies ten."""
 
 import json
 import os
@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from sim.study import campaign
 from sim.study.campaign import Drawn, drawn_faults, flight_of
 from sim.study.cli import study
 from sim.study.common import load_config
@@ -16,7 +17,11 @@ from sim.study.common import load_config
 @pytest.mark.timeout(1200)
 def test_twenty_flights_with_random_faults_break_no_rule(tmp_path: Path) -> None:
     quiet = Console(file=StringIO())
-    study("campaign", "0..19", tmp_path, jobs=len(os.sched_getaffinity(0)), console=quiet)
+    setup = tmp_path / "six.toml"
+    text = Path(campaign.__file__).with_suffix(".toml").read_text(encoding="utf-8")
+    setup.write_text(text.replace("vehicles = 10 ", "vehicles = 6 "), encoding="utf-8")
+    assert flight_of(load_config("campaign", setup)).vehicles == 6
+    study("campaign", "0..19", tmp_path, setup=setup, jobs=len(os.sched_getaffinity(0)), console=quiet)
     found = json.loads((tmp_path / "campaign.json").read_text(encoding="utf-8"))
     assert found["broken"] == []
     assert [row["count"] for row in found["rows"][:4]] == [0, 0, 0, 0]

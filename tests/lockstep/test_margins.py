@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-
 from flights import errors, failsafes, fleet, straight, truth, until_formed, wait
+
 from sim.lockstep import Lockstep
 
 SLOW_S = 0.060
