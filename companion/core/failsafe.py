@@ -171,7 +171,8 @@ FAILSAFES: dict[Failsafe, Row] = {
     ),
     Failsafe.KILLED: Row(
         "the autopilot's COM_OF_LOSS_T (1.0 s)", 1.0, Action.HAND_OVER,
-        "the autopilot's COM_OBL_RC_ACT; launchers set 4, land; one that starts in flight steers only on command",
+        "the autopilot's COM_OBL_RC_ACT; launchers set 4, land; in the climb it climbs on and holds; "
+        "one that starts in flight steers only on command",
         "`fleet resume`",
     ),
     Failsafe.STOPPED: Row(
