@@ -97,7 +97,6 @@ def fleet_report(
     rows += _starts(config, heard)
     rows += _change(config, heard)
     rows += _plan(config)
-    rows += fence_checks(config)
     return Report(tuple(rows))
 
 
@@ -327,8 +326,3 @@ def _plan(config: FleetConfig) -> Iterator[Check]:
         "plan's speed", tidy(fastest), f"<= {most:g} m/s", fastest <= most * (1.0 + 1e-6),
         f"the plan flies at {fastest:.2f} m/s, may at {most:g} m/s", lasting=True,
     )  # fmt: skip
-
-
-def fence_checks(config: FleetConfig) -> tuple[Check, ...]:  # noqa: ARG001
-    """Whether formation and plan stay inside the fence: no rows, since there is none to stay inside of."""
-    return ()
