@@ -1,4 +1,4 @@
-"""Twenty flights of the fault campaign with six vehicles; `fleet study campaign --seeds 0..499 --jobs 2` flies ten."""
+"""Twenty flights of the fault campaign with four vehicles; `fleet study campaign --seeds 0..499 --jobs 2` flies ten."""
 
 import json
 import os
@@ -17,10 +17,10 @@ from sim.study.common import load_config
 @pytest.mark.timeout(1200)
 def test_twenty_flights_with_random_faults_break_no_rule(tmp_path: Path) -> None:
     quiet = Console(file=StringIO())
-    setup = tmp_path / "six.toml"
+    setup = tmp_path / "four.toml"
     text = Path(campaign.__file__).with_suffix(".toml").read_text(encoding="utf-8")
-    setup.write_text(text.replace("vehicles = 10 ", "vehicles = 6 "), encoding="utf-8")
-    assert flight_of(load_config("campaign", setup)).vehicles == 6
+    setup.write_text(text.replace("vehicles = 10 ", "vehicles = 4 "), encoding="utf-8")
+    assert flight_of(load_config("campaign", setup)).vehicles == 4
     study("campaign", "0..19", tmp_path, setup=setup, jobs=len(os.sched_getaffinity(0)), console=quiet)
     found = json.loads((tmp_path / "campaign.json").read_text(encoding="utf-8"))
     assert found["broken"] == []

@@ -28,7 +28,7 @@ def flown(command_delay_s: float, lag_s: float = 0.15) -> tuple[float, float]:
     return float(np.sqrt(np.square(formation).mean())), float(np.sqrt(np.square(relative).sum(axis=2).mean()))
 
 
-@pytest.mark.parametrize("lag_s", [0.15, 0.3])
+@pytest.mark.parametrize("lag_s", [0.3])
 def test_60_ms_more_in_the_own_loop_stay_stable(lag_s: float) -> None:
     formation_m, velocity_m_s = flown(0.0, lag_s)
     slow_formation_m, slow_velocity_m_s = flown(SLOW_S, lag_s)
