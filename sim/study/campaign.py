@@ -37,6 +37,8 @@ AUTOPILOT_FAULTS = (
     "pilot_sticks", "rc_kill", "slow_link",
 )  # fmt: skip
 FLEET_FAULTS = ("killed", "restarted", "stalled", "partition")
+HANDED_OVER = frozenset({Px4Mode.AUTO_LOITER, Px4Mode.POSCTL})
+"""the autopilot's hold, and the pilot's: who flies in them without a companion is in somebody's hands"""
 OF_THE_FLEET = ("all peers lost", "the others never come", "no way back")
 """failsafes that another's fault explains"""
 
@@ -173,12 +175,13 @@ def fly(flight: Flight, seed: int) -> Record:
 def _stuck(ls: Lockstep) -> list[list[Any]]:
     """Vehicles in the air that nobody but us has in hand, and companions that still wait to take off.
 
-    A companion that ends in the climb leaves its vehicle in the autopilot's hold: that is handed over, and counted.
+    A companion that ends in the climb leaves its vehicle in the autopilot's hold, one that ends after a takeover in the
+    pilot's hands: that is handed over, and counted.
     """
     stuck: list[list[Any]] = []
     for i, v in ls.vehicles.items():
         ours = v.alive and v.agent.phase in FLYING_PHASES | {Phase.PREFLIGHT}
-        if ours or (_orphan(v) and v.autopilot.truth().custom_mode != Px4Mode.AUTO_LOITER):
+        if ours or (_orphan(v) and v.autopilot.truth().custom_mode not in HANDED_OVER):
             stuck.append([i, v.agent.phase.name.lower() if v.alive else "companion ended"])
     return stuck
 
@@ -269,7 +272,7 @@ def finish(config: Config, pieces: Sequence[Record], seeds: Sequence[int]) -> Ou
     })  # fmt: skip
     held = [bool(p["left_in_hold"]) for p in pieces]
     rows.append({
-        "what": "a companion killed in the climb left its vehicle in the autopilot's hold (not judged)",
+        "what": "a companion that ended left its vehicle in the autopilot's hold or with its pilot (not judged)",
         "flights": proportion_text(sum(held), n), "count": sum(held),
     })  # fmt: skip
     outcome = Outcome()
