@@ -50,7 +50,6 @@ Real = Annotated[float, Field(ge=-1e5, le=1e5, allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, le=1e5, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, le=1e5, allow_inf_nan=False)]
 Gain = Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)]
-Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 Percent = Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)]
 VehicleId = Annotated[int, Field(ge=1, le=250)]
 

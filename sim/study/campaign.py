@@ -2,29 +2,24 @@
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from pathlib import Path
+from dataclasses import dataclass
 from random import Random
 from typing import Any
 
 import numpy as np
 
 from companion.config import FleetConfig, parse
+from companion.core.safety import COLLISION_DISTANCE_M as COLLISION_M
 from companion.core.values import FLYING_PHASES, Phase
-from companion.errors import ConfigError
+from companion.flight import ON_GROUND
 from companion.wire.mavlink import Px4Mode
 from sim.lockstep import Lockstep, Vehicle
 from sim.network import NetworkParameters
 from sim.px4.faults import Fault, FaultKind
-from sim.study.common import Column, Config, Outcome, Record, Table, proportion_text
+from sim.study.common import FLYING_CODE, Column, Config, Outcome, Record, Table, proportion_text, table_of
 
 TITLE = "Fault campaign: flights with one to three faults each"
-SOURCES = tuple(
-    sorted(p for folder in ("companion", "sim") for p in (Path(__file__).parents[2] / folder).rglob("*.py"))
-)
-"""everything that flies here: finished seeds are run anew when any of it changes"""
-COLLISION_M = 0.5
-ON_GROUND = 1
+SOURCES = FLYING_CODE
 READY_S = 60.0
 ESTIMATE_FAULTS = frozenset({"gps_lost", "position_frozen", "estimator_reset", "noise"})
 """after these a vehicle does not know where it is, and nobody can: distance and fence are not judged for it"""
@@ -32,10 +27,7 @@ LEFT_TO_OTHERS = frozenset(
     {"reboot", "rc_kill", "pilot_takeover", "pilot_sticks", "mute", "killed", "restarted", "slow_link"}
 )
 """after these the vehicle is the pilot's or its autopilot's: its path is not judged against the fence"""
-AUTOPILOT_FAULTS = (
-    "gps_lost", "position_frozen", "estimator_reset", "noise", "low_battery", "reboot", "mute", "pilot_takeover",
-    "pilot_sticks", "rc_kill", "slow_link",
-)  # fmt: skip
+AUTOPILOT_FAULTS = tuple(kind.value for kind in FaultKind)
 FLEET_FAULTS = ("killed", "restarted", "stalled", "partition")
 HANDED_OVER = frozenset({Px4Mode.AUTO_LOITER, Px4Mode.POSCTL})
 """the autopilot's hold, and the pilot's: who flies in them without a companion is in somebody's hands"""
@@ -74,12 +66,7 @@ class Drawn:
 
 def flight_of(config: Config) -> Flight:
     """The set-up's flight; a missing or unknown key is refused."""
-    given = dict(config.values.get("flight", {}))
-    known = {f.name for f in fields(Flight)}
-    if set(given) != known:
-        wrong = ", ".join(sorted(set(given) ^ known))
-        raise ConfigError(f"campaign.toml: $.flight must have the keys {', '.join(sorted(known))}; wrong: {wrong}")
-    return Flight(**given)
+    return table_of(config, "flight", Flight)
 
 
 def drawn_faults(flight: Flight, seed: int) -> list[Drawn]:

@@ -2,6 +2,7 @@
 
 import csv
 import importlib
+import inspect
 import json
 import math
 import os
@@ -13,7 +14,7 @@ from hashlib import blake2s
 from multiprocessing import get_context
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -30,6 +31,10 @@ Record = dict[str, Any]
 STUDIES = ("example1", "example2", "table3", "readings", "pareto", "faults", "scale", "theory")
 FLOWN_STUDIES = ("headon", "campaign")
 """studies that fly the real agents in lockstep: hours of CPU time, so `all` leaves them out"""
+FLYING_CODE = tuple(
+    sorted(p for folder in ("companion", "sim") for p in (Path(__file__).parents[2] / folder).rglob("*.py"))
+)
+"""everything that flies in those: their finished seeds are run anew when any of it changes"""
 
 # Payloads as `companion.wire.peer` lays them out (bytes); the published intent carries c, g, w, e, e' instead of p, v.
 MESSAGE_BYTES = 57
@@ -114,6 +119,19 @@ class Config:
     def published(self) -> Mapping[str, Any]:
         """What the paper prints."""
         return dict(self.values.get("published", {}))
+
+
+T = TypeVar("T")
+
+
+def table_of(config: Config, name: str, kind: type[T]) -> T:
+    """One table of a set-up as a dataclass's value; a missing or unknown key is refused."""
+    given = dict(config.values.get(name, {}))
+    known = set(inspect.signature(kind).parameters)
+    if set(given) != known:
+        wrong = ", ".join(sorted(set(given) ^ known))
+        raise ConfigError(f"{config.name}.toml: $.{name} must have the keys {', '.join(sorted(known))}; wrong: {wrong}")
+    return kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in given.items()})
 
 
 def load_config(name: str, path: Path | None = None) -> Config:

@@ -5,10 +5,9 @@ what the law says is replaced, just before the filter, by a command that flies a
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import product
 from math import dist
-from pathlib import Path
 from random import Random
 from typing import Any
 
@@ -16,20 +15,17 @@ import numpy as np
 
 from companion.config import FleetConfig, parse
 from companion.core.frames import Ned
+from companion.core.safety import COLLISION_DISTANCE_M as COLLISION_M
 from companion.core.values import Phase
 from companion.errors import ConfigError
 from sim.broken_law import BrokenLaw
 from sim.lockstep import Lockstep
 from sim.network import NetworkParameters
-from sim.study.common import Column, Config, Figure, Outcome, Record, Table, proportion_text
+from sim.study.common import FLYING_CODE, Column, Config, Figure, Outcome, Record, Table, proportion_text, table_of
 from sim.study.figures import BLUE, GREEN, GREY, RED, panels
 
 TITLE = "Head-on by a broken law: lag, delay and loss"
-SOURCES = tuple(
-    sorted(p for folder in ("companion", "sim") for p in (Path(__file__).parents[2] / folder).rglob("*.py"))
-)
-"""everything that flies here: finished seeds are run anew when any of it changes"""
-COLLISION_M = 0.5
+SOURCES = FLYING_CODE
 BAR_M = 0.85
 READY_S = 200.0
 """on the ground they speak every 8 to 10 s: at 50 % loss it takes a while until both have heard each other"""
@@ -55,13 +51,7 @@ class Meeting:
 
 def meeting_of(config: Config) -> Meeting:
     """The set-up's meeting; a missing or unknown key is refused."""
-    given = dict(config.values.get("meeting", {}))
-    known = {f.name for f in fields(Meeting)}
-    if set(given) != known:
-        wrong = ", ".join(sorted(set(given) ^ known))
-        raise ConfigError(f"headon.toml: $.meeting must have the keys {', '.join(sorted(known))}; wrong: {wrong}")
-    values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in given.items()}
-    return Meeting(**values)
+    return table_of(config, "meeting", Meeting)
 
 
 def _fleet(meeting: Meeting, lag_s: float, barrier: bool, aside_m: float) -> FleetConfig:

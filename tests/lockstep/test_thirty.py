@@ -1,11 +1,20 @@
 """Thirty vehicles change their formation with crossing paths: nobody comes close, nobody is stuck."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
-from flights import DEFAULT, distances, errors, failsafes, launch, truth, until, until_formed, until_landed, wait
-from test_faults import InLockstep
+from flights import (
+    DEFAULT,
+    InLockstep,
+    distances,
+    errors,
+    failsafes,
+    launch,
+    truth,
+    until,
+    until_formed,
+    until_landed,
+    wait,
+)
 
 from companion.config import FleetConfig, load
 from companion.core.values import Phase
@@ -15,13 +24,13 @@ SETTLED_WITHIN_S = 60.0
 CLEARANCE_M = 0.75
 
 
-def thirty(path: Path = DEFAULT) -> FleetConfig:
+def thirty() -> FleetConfig:
     def change(tables: dict[str, object]) -> None:
         tables["vehicle"] = [{"id": i} for i in range(1, 31)]
         tables["limits"]["control_rate_hz"] = 25.0  # type: ignore[index]
         tables["plan"] = {"then": "stay"}
 
-    return load(path, change)
+    return load(DEFAULT, change)
 
 
 @pytest.mark.long
