@@ -273,6 +273,10 @@ class Flight:
         """Lead the autopilot through the flight, and notice when something fails."""
         ap = self.autopilot
         self._watch_orders(now)
+        if self.positions.jumps != self._jumps and (self.phase not in FLYING_PHASES or ap.landed_state == ON_GROUND):
+            # PX4's estimator resets on the ground too, seconds before arming: there is nothing to hold yet.
+            self._jumps = self.positions.jumps
+            ap.doubt_origin()
         silent = ap.heartbeat_ns is not None and now.monotonic_ns - ap.heartbeat_ns > HEARTBEAT_S * 1e9
         if silent and self.phase in FLYING_PHASES:
             # In whatever phase: a landing of which nobody tells the end would last for ever.

@@ -274,8 +274,9 @@ def parameter_rules(config: FleetConfig) -> dict[str, Rule]:
             f"<= {longest:g} s", lambda v: v <= longest * (1.0 + ROUNDING), "the autopilot acts too late"
         ),
         "COM_OBL_RC_ACT": Rule(
-            *(_one_of(0, 3, 4, 5) if pilot else _one_of(3, 4, 5)),
-            "when setpoints end it must return, land or hold; position mode sinks to the ground without RC",
+            *(_one_of(0, 4, 5) if pilot else _one_of(4, 5)),
+            "when setpoints end it must land or hold; position mode sinks to the ground without RC, and nobody tells "
+            "the others of a way back",
         ),
         "COM_RC_OVERRIDE": Rule("has bit 1", lambda v: bool(int(v) & 2), "a pilot's sticks would not end OFFBOARD"),
         "NAV_RCL_ACT": Rule(

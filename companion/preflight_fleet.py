@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import combinations
-from math import hypot, sqrt
+from math import hypot, inf, sqrt
 from statistics import median
 from typing import Any
 
@@ -215,7 +215,7 @@ def _starts(config: FleetConfig, heard: Mapping[int, Account]) -> Iterator[Check
     least = _separation_m(config)
     known = {i: a for i, a in heard.items() if a.position_ned_m is not None and not a.flying}
     close, crossing = [], []
-    nearest = nearest_way = float("inf")
+    nearest = nearest_way = inf
     for (i, a), (j, b) in combinations(known.items(), 2):
         p, q = a.position_ned_m, b.position_ned_m
         assert p is not None
@@ -229,6 +229,14 @@ def _starts(config: FleetConfig, heard: Mapping[int, Account]) -> Iterator[Check
         nearest_way = min(nearest_way, way)
         if way < least:
             crossing.append(f"ways of vehicle {i} and {j} from where they stand come within {way:.2f} m")
+    fence = config.geofence
+    if fence is not None:
+        inside = {i: fence.edge_clearance_m(*a.position_ned_m[:2]) for i, a in known.items() if a.position_ned_m}
+        outside = [f"vehicle {i} stands {-room:.2f} m outside the fence" for i, room in inside.items() if room < 0.0]
+        yield Check(
+            "start in the fence", tidy(min(inside.values(), default=inf)), ">= 0 m inside", not outside,
+            "; ".join(outside), lasting=True,
+        )  # fmt: skip
     yield Check(
         "start positions", tidy(nearest), f">= {least:.2f} m apart", not close,
         f"{'; '.join(close)}; must be {least:.2f} m", lasting=True,
@@ -248,7 +256,7 @@ def _change(config: FleetConfig, heard: Mapping[int, Account]) -> Iterator[Check
     pairs = change_distances_m(motion)
     crossing = [f"vehicle {i} and {j} come within {d:.2f} m" for (i, j), d in pairs.items() if d < least]
     yield Check(
-        "ways to the slots", tidy(min(pairs.values(), default=float("inf"))), f">= {least:.2f} m apart", not crossing,
+        "ways to the slots", tidy(min(pairs.values(), default=inf)), f">= {least:.2f} m apart", not crossing,
         f"{'; '.join(crossing)} on their ways to {config.formation.shape!r}; must be {least:.2f} m", lasting=True,
     )  # fmt: skip
 

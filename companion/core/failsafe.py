@@ -109,8 +109,10 @@ FAILSAFES: dict[Failsafe, Row] = {
         _BY_COMMAND,
     ),
     Failsafe.POSITION_JUMPED: Row(
-        "the first position 0.5 m or 0.5 m/s beyond what the motion explains (10 sigma of `limits.*_noise_*` if more)",
-        0.0, Action.HOLD, "where it now believes to be; the estimator's origin is asked for again",
+        "in the air, the first position 0.5 m or 0.5 m/s beyond what the motion explains (10 sigma of "
+        "`limits.*_noise_*` if more)",
+        0.0, Action.HOLD,
+        "where it now believes to be; the estimator's origin is asked for again, as it is after a jump on the ground",
         "3 s after the last jump it comes back to its slot",
     ),
     Failsafe.POSITION_JUMPS: Row("10 s of jumps", JUMPS_S, Action.LAND, "", _NOT),

@@ -288,6 +288,7 @@ class Companion:
         status["recorder_lost"] = 0 if self.recorder is None else self.recorder.lost
         elsewhere = {
             "mavlink: another address than the autopilot's": self.link.strangers,
+            "mavlink: could not be sent": self.link.send_failures,
             "peer: malformed": counters.malformed,
             "peer: under our own id": counters.own_id_heard,
         }

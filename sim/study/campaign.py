@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from companion.config import FleetConfig, parse
+from companion.core.failsafe import Failsafe
 from companion.core.safety import COLLISION_DISTANCE_M as COLLISION_M
 from companion.core.values import FLYING_PHASES, Phase
 from companion.flight import ON_GROUND
@@ -23,16 +24,34 @@ SOURCES = FLYING_CODE
 READY_S = 60.0
 ESTIMATE_FAULTS = frozenset({"gps_lost", "position_frozen", "estimator_reset", "noise"})
 """after these a vehicle does not know where it is, and nobody can: distance and fence are not judged for it"""
-LEFT_TO_OTHERS = frozenset(
-    {"reboot", "rc_kill", "pilot_takeover", "pilot_sticks", "mute", "killed", "restarted", "slow_link"}
-)
-"""after these the vehicle is the pilot's or its autopilot's: its path is not judged against the fence"""
-AUTOPILOT_FAULTS = tuple(kind.value for kind in FaultKind)
-FLEET_FAULTS = ("killed", "restarted", "stalled", "partition")
 HANDED_OVER = frozenset({Px4Mode.AUTO_LOITER, Px4Mode.POSCTL})
 """the autopilot's hold, and the pilot's: who flies in them without a companion is in somebody's hands"""
-OF_THE_FLEET = ("all peers lost", "the others never come", "no way back")
-"""failsafes that another's fault explains"""
+_F = Failsafe
+OF_THE_FLEET = frozenset({_F.MISSING, _F.ALONE, _F.ALONE_FOR_LONG, _F.APART_FOR_LONG})
+"""failsafes that a fault of another, or of the network, explains"""
+_NO_POSITION = {_F.POSITION_LOST, _F.POSITION_JUMPED, _F.AUTOPILOT, _F.NOT_ARMED, _F.NO_TAKE_OFF}
+"""no position, then one elsewhere; without setpoints the autopilot acts too"""
+EXPLAINED: dict[str, frozenset[Failsafe]] = {
+    kind: OF_THE_FLEET | own
+    for kind, own in {
+        "gps_lost": _NO_POSITION | {_F.POSITION_JUMPS, _F.COVARIANCE},
+        "position_frozen": _NO_POSITION,
+        "estimator_reset": {_F.POSITION_JUMPED},
+        "noise": {_F.POSITION_JUMPED, _F.POSITION_JUMPS},
+        "low_battery": {_F.BATTERY_LOW, _F.BATTERY_CRITICAL, _F.NOT_ARMED},
+        "reboot": _NO_POSITION | {_F.HEARTBEAT},
+        "mute": _NO_POSITION | {_F.HEARTBEAT},
+        "pilot_takeover": {_F.PILOT},
+        "pilot_sticks": {_F.PILOT},
+        "rc_kill": set(),
+        "slow_link": _NO_POSITION | {_F.HEARTBEAT},
+        "killed": set(),
+        "restarted": set(),
+        "stalled": {_F.AUTOPILOT},
+        "partition": set(),
+    }.items()
+}
+"""fault -> the failsafes of the same vehicle that it explains, from when it comes on"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +67,7 @@ class Flight:
     loss: float
     delay_s: float
     fence_radius_m: float
+    fence_floor_m: float
     fence_ceiling_m: float
 
 
@@ -74,7 +94,7 @@ def drawn_faults(flight: Flight, seed: int) -> list[Drawn]:
     random = Random(f"campaign/{seed}")
     faults = []
     for _ in range(random.randint(1, flight.most_faults)):
-        kind = random.choice((*AUTOPILOT_FAULTS, *FLEET_FAULTS))
+        kind = random.choice(tuple(EXPLAINED))
         i = 0 if kind == "partition" else random.randint(1, flight.vehicles)
         magnitude = {"noise": random.uniform(0.2, 1.0), "low_battery": random.choice((0.05, 0.15))}.get(kind)
         at_s = random.uniform(flight.faults_from_s, flight.faults_to_s)
@@ -82,7 +102,7 @@ def drawn_faults(flight: Flight, seed: int) -> list[Drawn]:
     return sorted(faults, key=lambda f: f.at_s)
 
 
-def _fleet(flight: Flight) -> FleetConfig:
+def _fleet(flight: Flight, missing: str) -> FleetConfig:
     return parse(
         {
             "fleet": {
@@ -99,8 +119,12 @@ def _fleet(flight: Flight) -> FleetConfig:
                 ],
             },
             "limits": {"control_rate_hz": 25.0},
-            "peers": {"wait_s": 25.0},
-            "fence": {"radius_m": flight.fence_radius_m, "floor_m": 1.0, "ceiling_m": flight.fence_ceiling_m},
+            "peers": {"wait_s": 25.0, "missing": missing},
+            "fence": {
+                "radius_m": flight.fence_radius_m,
+                "floor_m": flight.fence_floor_m,
+                "ceiling_m": flight.fence_ceiling_m,
+            },
             "vehicle": [{"id": i} for i in range(1, flight.vehicles + 1)],
         },
         "campaign.toml",
@@ -130,7 +154,7 @@ def _inject(ls: Lockstep, fault: Drawn, random: Random) -> None:
 
 def fly(flight: Flight, seed: int) -> Record:
     """One flight from take-off to the end of the last vehicle's; what was seen of it."""
-    config = _fleet(flight)
+    config = _fleet(flight, Random(f"campaign/{seed}/missing").choice(("land", "continue")))
     ls = Lockstep(config, seed=seed, network=NetworkParameters(delay_s=flight.delay_s, loss=flight.loss))
     ls.run_until(READY_S, lambda: not any(v.agent.unready(ls.now) for v in ls.vehicles.values()))
     ls.command(b'{"verb":"takeoff"}')
@@ -147,14 +171,15 @@ def fly(flight: Flight, seed: int) -> Record:
             else:
                 _inject(ls, fault, random)
     ls.run_until(began_s + flight.seconds, lambda: not _stuck(ls))
+    failsafes = [(round(s - began_s, 3), i, failsafe) for s, i, failsafe in _failsafes(ls)]
     return {
         "faults": [[round(f.at_s, 3), f.vehicle_id, f.kind, f.duration_s, f.magnitude] for f in faults],
         **_distances(ls, faults, began_s),
         **_breach(ls, faults, flight, began_s),
         "stuck": _stuck(ls),
         "left_in_hold": [i for i, v in ls.vehicles.items() if _orphan(v)],
-        "unexplained": _unexplained(ls, faults),
-        "failsafes": dict(Counter(n.removeprefix("failsafe: ").split(":")[0] for _, _, n in _failsafes(ls))),
+        "unexplained": [told for told in failsafes if not _explained(told, faults)],
+        "failsafes": failsafes,
         "ended_after_s": ls.now_ns * 1e-9 - began_s,
     }
 
@@ -177,18 +202,17 @@ def _orphan(v: Vehicle) -> bool:
     return not v.alive and v.autopilot.truth().landed_state != ON_GROUND
 
 
-def _failsafes(ls: Lockstep) -> list[tuple[float, int, str]]:
-    return [n for n in ls.notes if n[2].startswith("failsafe")]
+def _failsafes(ls: Lockstep) -> list[tuple[float, int, Failsafe]]:
+    """Every failsafe that a vehicle told of: when (s), whose, which."""
+    said = [(s, i, n.removeprefix("failsafe: ")) for s, i, n in ls.notes if n.startswith("failsafe: ")]
+    return [(s, i, Failsafe(n.split(":")[0])) for s, i, n in said]
 
 
-def _unexplained(ls: Lockstep, faults: Sequence[Drawn]) -> list[list[Any]]:
-    """Failsafes of vehicles that had no fault, beyond those that another's fault explains."""
-    own = {f.vehicle_id for f in faults}
-    return [
-        [round(s, 2), i, text]
-        for s, i, text in _failsafes(ls)
-        if i not in own and not any(reason in text for reason in OF_THE_FLEET)
-    ]
+def _explained(told: tuple[float, int, Failsafe], faults: Sequence[Drawn]) -> bool:
+    """Whether a fault that came before it explains a failsafe."""
+    at_s, i, failsafe = told
+    before = [f for f in faults if f.at_s <= at_s]
+    return any(failsafe in (EXPLAINED[f.kind] if f.vehicle_id == i else OF_THE_FLEET) for f in before)
 
 
 def _rows(ls: Lockstep, began_s: float) -> tuple[Any, Any]:
@@ -226,12 +250,16 @@ def _distances(ls: Lockstep, faults: Sequence[Drawn], began_s: float) -> Record:
 
 
 def _breach(ls: Lockstep, faults: Sequence[Drawn], flight: Flight, began_s: float) -> Record:
-    """The farthest that a vehicle in our hands was beyond the fence (m); negative inside."""
+    """The farthest that a vehicle on our setpoints, or on the last of them, was beyond the fence (m); negative inside.
+
+    The floor is for vehicles in formation: OFFBOARD begins above it and ends before a landing.
+    """
     rows, seconds = _rows(ls, began_s)
-    ids = list(ls.vehicles)
     p = rows["position_ned_m"]
-    beyond = np.maximum(np.hypot(p[:, :, 0], p[:, :, 1]) - flight.fence_radius_m, -p[:, :, 2] - flight.fence_ceiling_m)
-    judged = seconds[:, None] < _since(ids, faults, ESTIMATE_FAULTS | LEFT_TO_OTHERS)[None, :]
+    level, height = np.hypot(p[:, :, 0], p[:, :, 1]), -p[:, :, 2]
+    beyond = np.max([level - flight.fence_radius_m, height - flight.fence_ceiling_m, flight.fence_floor_m - height], 0)
+    ours = (rows["custom_mode"] == Px4Mode.OFFBOARD) & (rows["landed_state"] != ON_GROUND)
+    judged = ours & (seconds[:, None] < _since(list(ls.vehicles), faults, ESTIMATE_FAULTS)[None, :])
     return {"beyond_fence_m": float(np.where(judged, beyond, -np.inf).max())}
 
 
@@ -277,7 +305,7 @@ def finish(config: Config, pieces: Sequence[Record], seeds: Sequence[int]) -> Ou
     kinds = Counter(kind for p in pieces for _, _, kind, _, _ in p["faults"])
     taken = Counter[str]()
     for p in pieces:
-        taken.update(p["failsafes"])
+        taken.update(failsafe for _, _, failsafe in p["failsafes"])
     outcome.tables.append(
         Table("campaign_faults", "What was injected", (Column("kind", "fault"), Column("count", "times", 0)), [
             {"kind": kind, "count": count} for kind, count in kinds.most_common()

@@ -1,6 +1,7 @@
 """Flights in lockstep for the tests: how they are set up, and what is true of them afterwards."""
 
 import json
+import struct
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from hashlib import blake2b
@@ -160,6 +161,17 @@ def last(ls: Lockstep, text: str) -> float:
 
 def failsafes(ls: Lockstep) -> list[tuple[int, str]]:
     return [(i, note) for _, i, note in ls.notes if note.startswith("failsafe")]
+
+
+GROUND_STATION: Any = dialect.MAVLink(None, srcSystem=255, srcComponent=190)
+
+
+def set_parameter(ls: Lockstep, i: int, name: str, value: float | int) -> None:
+    """A ground station's PARAM_SET to one autopilot; an int as INT32."""
+    whole = isinstance(value, int)
+    wire_value = struct.unpack("<f", struct.pack("<i", value))[0] if whole else value
+    message = dialect.MAVLink_param_set_message(i, 1, name.encode(), wire_value, 6 if whole else 9)
+    ls.vehicles[i].autopilot.receive(bytes(message.pack(GROUND_STATION)), ls.now_ns)
 
 
 def parse(datagram: bytes) -> Any:

@@ -6,12 +6,26 @@ from dataclasses import dataclass
 from typing import Any
 
 import pytest
-from flights import distances, first, fleet, launch, straight, truth, until, until_formed, until_landed, wait
+from flights import (
+    distances,
+    errors,
+    failsafes,
+    first,
+    fleet,
+    launch,
+    straight,
+    truth,
+    until,
+    until_formed,
+    until_landed,
+    wait,
+)
 from pymavlink.dialects.v20 import development as dialect
 
 from companion.core.failsafe import FAILSAFES, LATE_S, Action, Failsafe
 from companion.core.frames import Ned
 from companion.core.values import Instant, PeerMessage, Phase
+from companion.flight import ON_GROUND
 from companion.wire.mavlink import Px4Mode, mode_parameters
 from companion.wire.peer import encode_state
 from sim.lockstep import Lockstep
@@ -525,3 +539,28 @@ def test_actions_are_what_the_scenarios_check() -> None:
     assert {f for f, row in FAILSAFES.items() if row.action is Action.HOLD} == {
         Failsafe.POSITION_JUMPED, Failsafe.ALONE,
     }  # fmt: skip
+
+
+@pytest.mark.parametrize("when", ["disarmed", "armed on the ground"])
+def test_a_position_that_jumps_on_the_ground_is_no_failsafe_in_the_air(when: str) -> None:
+    # PX4's estimator resets its position on the ground, seconds before it may be armed.
+    ls = Lockstep(fleet(2), seed=8)
+    ls.run_until(10.0, lambda: not any(v.agent.unready(ls.now) for v in ls.vehicles.values()))
+    s = Scene(ls, [])
+    if when == "armed on the ground":
+        ls.command(b'{"verb":"takeoff"}')
+        until(ls, 5.0, lambda: ls.vehicles[1].autopilot.truth().armed)
+    assert ls.vehicles[1].autopilot.truth().landed_state == ON_GROUND
+    s.tamper(49)
+    s.inject(FaultKind.ESTIMATOR_RESET)
+    wait(ls, 0.5)
+    assert s.ls.vehicles[1].agent.flight.positions.jumps == 1
+    s.tamper()
+    if when == "disarmed":
+        wait(ls, 2.0)
+        ls.command(b'{"verb":"takeoff"}')
+    until_formed(ls)
+    assert failsafes(ls) == []
+    assert not any("-> apart" in note for _, _, note in ls.notes)
+    formation, _ = errors(ls, truth(ls, ls.now_ns * 1e-9 - 0.5), [1, 2])
+    assert formation.max() < 0.5, "its new origin is known"

@@ -16,6 +16,7 @@ from flights import (
     fleet,
     last,
     launch,
+    set_parameter,
     straight,
     truth,
     until,
@@ -55,37 +56,57 @@ def held(ls: Lockstep) -> set[bytes]:
 
 
 class Killed:
-    """A flight at 1 m/s whose foremost companion is killed."""
+    """A flight at 1 m/s whose foremost companion is killed; its autopilot lands it, or stops it where it is."""
 
-    def __init__(self, shape: str, altitude_m: float, plan_s: float) -> None:
-        config = fleet(5, altitude_m=altitude_m, shape=shape, legs=straight(plan_s))
+    def __init__(self, shape: str, altitude_m: float, plan_s: float, spacing_m: float, stops: bool) -> None:
+        def spaced(tables: dict[str, Any]) -> None:
+            tables["formation"]["spacing_m"] = spacing_m
+
+        config = fleet(5, altitude_m=altitude_m, shape=shape, legs=straight(plan_s), change=spaced)
         self.ls = launch(config, seed=2)
         until_formed(self.ls)
-        wait(self.ls, 8.0)
+        until(self.ls, 10.0, lambda: self.ls.all_in(Phase.MOVING))
+        wait(self.ls, 6.0)
         self.killed = leader(self.ls)
+        if stops:
+            set_parameter(self.ls, self.killed, "COM_OBL_RC_ACT", 5)
+        self.stops = stops
         self.killed_s = self.ls.now_ns * 1e-9
         self.ls.kill(self.killed)
         self.others = [i for i in self.ls.vehicles if i != self.killed]
         until_landed(self.ls, 90.0)
 
 
+FLIGHTS = {
+    "v": ("v", 3.0, 20.0, 4.0, False),
+    "column": ("column", 6.0, 24.0, 4.0, False),
+    "column of 3 m": ("column", 6.0, 30.0, 3.0, False),
+    "column of 3 m, stopped": ("column", 6.0, 30.0, 3.0, True),
+}
+
+
 @cache
-def flown(shape: str) -> Killed:
-    return Killed(shape, *{"v": (3.0, 20.0), "column": (6.0, 24.0)}[shape])
+def flown(name: str) -> Killed:
+    return Killed(*FLIGHTS[name])
 
 
-@pytest.fixture(params=["v", "column"])
+@pytest.fixture(params=FLIGHTS)
 def killed(request: pytest.FixtureRequest) -> Killed:
     """Each flown once, in whatever order the tests come."""
     return flown(request.param)
 
 
-def test_the_lost_vehicles_own_autopilot_lands_it(killed: Killed) -> None:
+def test_the_lost_vehicles_own_autopilot_lands_it_or_stops_it(killed: Killed) -> None:
     t = truth(killed.ls, killed.killed_s)
     k = t.column(killed.killed)
-    assert Px4Mode.AUTO_LAND in t.mode[:, k]
-    assert not t.armed[-1, k]
-    assert abs(t.position_ned_m[-1, k, 2]) < 0.3
+    if killed.stops:
+        assert t.mode[-1, k] == Px4Mode.AUTO_LOITER
+        assert np.linalg.norm(t.velocity_ned_m_s[-1, k]) < 0.5
+        assert t.position_ned_m[-1, k, 2] < -5.0
+    else:
+        assert Px4Mode.AUTO_LAND in t.mode[:, k]
+        assert not t.armed[-1, k]
+        assert abs(t.position_ned_m[-1, k, 2]) < 0.3
 
 
 def test_the_others_keep_apart_from_each_other_and_from_the_lost_one(killed: Killed) -> None:

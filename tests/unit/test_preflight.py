@@ -147,7 +147,7 @@ def test_a_local_frame_needs_neither_origin_nor_global_position() -> None:
 
 PARAMETER_LIMITS: list[tuple[str, list[float], list[float]]] = [
     ("COM_OF_LOSS_T", [0.5, 1.0], [1.001, 5.0]),
-    ("COM_OBL_RC_ACT", [3, 4, 5], [-1, 0, 1, 2, 6, 7]),
+    ("COM_OBL_RC_ACT", [4, 5], [-1, 0, 1, 2, 3, 6, 7]),
     ("COM_RC_OVERRIDE", [2, 3], [0, 1]),
     ("NAV_RCL_ACT", [0, 1, 2, 3], [-1, 4, 5, 6]),
     ("COM_RCL_EXCEPT", [4, 5, 6, 7], [0, 1, 2, 3]),

@@ -201,6 +201,17 @@ def test_vehicles_must_stand_apart_by_the_safety_radius(gap_m: float, fit: bool)
     assert not faults if fit else faults[0].startswith("vehicle 1 and 2 stand 1.48 m apart; must be 1.49 m")
 
 
+@pytest.mark.parametrize(("beyond_m", "fit"), [(-0.01, True), (0.0, True), (0.01, False)])
+def test_vehicles_must_stand_inside_the_fence(beyond_m: float, fit: bool) -> None:
+    fence = CONFIG.geofence
+    assert fence is not None
+    assert fence.radius_m is not None
+    edge = fence.centre_north_m + fence.radius_m
+    there = account(2, position_ned_m=(edge + beyond_m, fence.centre_east_m, 0.0), slot_ned_m=(edge, 0.0, -10.0))
+    said = [f for f in report({2: there}).faults if "fence" in f]
+    assert said == ([] if fit else ["vehicle 2 stands 0.01 m outside the fence"])
+
+
 def test_vehicles_on_each_others_pads_cross() -> None:
     a, b = CONFIG.by_id(1), CONFIG.by_id(2)
     apart = b.pad_east_m - a.pad_east_m
