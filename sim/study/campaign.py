@@ -171,15 +171,15 @@ def fly(flight: Flight, seed: int) -> Record:
             else:
                 _inject(ls, fault, random)
     ls.run_until(began_s + flight.seconds, lambda: not _stuck(ls))
-    failsafes = [(round(s - began_s, 3), i, failsafe) for s, i, failsafe in _failsafes(ls)]
+    failsafes = [(round(s - began_s, 3), i, what) for s, i, what in _failsafes(ls)]
     return {
         "faults": [[round(f.at_s, 3), f.vehicle_id, f.kind, f.duration_s, f.magnitude] for f in faults],
         **_distances(ls, faults, began_s),
         **_breach(ls, faults, flight, began_s),
         "stuck": _stuck(ls),
         "left_in_hold": [i for i, v in ls.vehicles.items() if _orphan(v)],
-        "unexplained": [told for told in failsafes if not _explained(told, faults)],
-        "failsafes": failsafes,
+        "unexplained": [(s, i, what.value) for s, i, what in failsafes if not _explained((s, i, what), faults)],
+        "failsafes": [(s, i, what.value) for s, i, what in failsafes],
         "ended_after_s": ls.now_ns * 1e-9 - began_s,
     }
 

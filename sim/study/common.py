@@ -8,7 +8,7 @@ import math
 import os
 import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from hashlib import blake2s
 from multiprocessing import get_context
@@ -223,10 +223,16 @@ def pieces(config: Config, seeds: Sequence[int], out: Path, jobs: int, advance: 
             advance()
     else:
         with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-            waiting = {seed: pool.submit(_piece, config.name, config.text, seed) for seed in missing}
-            for seed, future in waiting.items():
-                done[seed] = _keep(paths[seed], future.result())
-                advance()
+            waiting = {pool.submit(_piece, config.name, config.text, seed): seed for seed in missing}
+            try:
+                for future in as_completed(waiting):
+                    seed = waiting[future]
+                    done[seed] = _keep(paths[seed], future.result())
+                    advance()
+            except BaseException:
+                # The pool waits for what it has begun, not for all that it was given.
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
     return [done[seed] for seed in seeds]
 
 

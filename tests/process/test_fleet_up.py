@@ -47,8 +47,10 @@ from fleet_process import (
 )
 
 from companion.__main__ import main as companion_main
+from companion.core.failsafe import Failsafe
 from companion.core.frames import Ned
 from companion.core.values import PeerMessage, PeerSample, Phase
+from companion.io.recorder import read_recording
 from companion.io.zenoh_peers import PeerNetworkSettings, scouting_port, zenoh_configuration
 from companion.operate import Operator
 from companion.replay import replay_file
@@ -59,6 +61,7 @@ from sim.__main__ import main as fleet_main
 pytestmark = [pytest.mark.process, pytest.mark.timeout(400)]
 
 FOR_EVER = "velocity:0.5:0:3600"
+EDITED = Failsafe.CONFIGURATION.value
 ON_GROUND = 1
 STALL_MS = 300.0
 LOOPBACK = "127.0.0.1"
@@ -336,7 +339,8 @@ class Loss:
 
 @pytest.fixture(scope="module")
 def loss(tmp_path_factory: pytest.TempPathFactory) -> Loss:
-    """Formed and moving; companion 2 dies, companion 3 can write no more, the launcher is interrupted."""
+    """Formed and moving; companion 2 dies, companion 3 can write no more, the companions' file is edited, the launcher
+    is interrupted."""
     fleet = make_fleet(tmp_path_factory.mktemp("loss"), 4)
     loss = Loss(fleet)
     out = fleet.folder / "flights"
@@ -347,8 +351,13 @@ def loss(tmp_path_factory: pytest.TempPathFactory) -> Loss:
         resource.prlimit(child(up.popen.pid, "run --vehicle 3 "), resource.RLIMIT_FSIZE, (0, 0))
         os.kill(child(up.popen.pid, "run --vehicle 2 "), signal.SIGKILL)
         loss.killed_ns = time.time_ns()
+        with (loss.folder / "fleet.toml").open("a") as file:
+            file.write("# edited in flight\n")
         assert eventually(lambda: truth(loss.folder / "truth.bin", 2)["armed"][-1] == 0)
-        loss.others = wait_status(operator, lambda said: len(said) == 3)
+        loss.others = wait_status(
+            operator,
+            lambda said: sorted(said) == [1, 3, 4] and all(rejected(s, EDITED) for s in said.values()),
+        )
         up.signal(signal.SIGINT)
         loss.exit_status = up.wait()
         loss.out, loss.err = up.out, up.err
@@ -390,6 +399,16 @@ def test_ctrl_c_lands_the_fleet_and_still_writes_the_summary(loss: Loss) -> None
 def test_a_companion_that_can_write_no_more_flies_on(loss: Loss) -> None:
     assert loss.others[3]["recorder_lost"] > 0
     assert loss.others[3]["phase"] in SETTLED
+    assert {i: rejected(s, Failsafe.DISK_FULL.value) for i, s in loss.others.items()} == {1: 0, 3: 1, 4: 0}
+
+
+def test_a_file_edited_in_flight_is_noted_once_and_changes_nothing(loss: Loss) -> None:
+    for i in (1, 3, 4):
+        assert rejected(loss.others[i], EDITED) == 1
+        assert loss.others[i]["phase"] in SETTLED
+        notes = read_recording(loss.folder / f"vehicle-{i}.mcap").entries
+        told = [e.body for e in notes if e.channel == "note" and EDITED.encode() in e.body]
+        assert len(told) == (i != 3), "vehicle 3 can write no more"
 
 
 def test_without_a_terminal_progress_is_a_line_now_and_then(loss: Loss) -> None:
