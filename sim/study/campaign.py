@@ -43,7 +43,7 @@ EXPLAINED: dict[str, frozenset[Failsafe]] = {
         "mute": _NO_POSITION | {_F.HEARTBEAT},
         "pilot_takeover": {_F.PILOT},
         "pilot_sticks": {_F.PILOT},
-        "rc_kill": set(),
+        "rc_kill": {_F.POSITION_JUMPED},
         "slow_link": _NO_POSITION | {_F.HEARTBEAT},
         "killed": set(),
         "restarted": set(),
@@ -51,7 +51,9 @@ EXPLAINED: dict[str, frozenset[Failsafe]] = {
         "partition": set(),
     }.items()
 }
-"""fault -> the failsafes of the same vehicle that it explains, from when it comes on"""
+"""fault -> the failsafes of the same vehicle that it explains, from when it comes on; who falls strikes the ground"""
+FALLS = frozenset({"rc_kill", "reboot"})
+"""the motors stop"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,14 +254,14 @@ def _distances(ls: Lockstep, faults: Sequence[Drawn], began_s: float) -> Record:
 def _breach(ls: Lockstep, faults: Sequence[Drawn], flight: Flight, began_s: float) -> Record:
     """The farthest that a vehicle on our setpoints, or on the last of them, was beyond the fence (m); negative inside.
 
-    The floor is for vehicles in formation: OFFBOARD begins above it and ends before a landing.
+    The floor is for vehicles in formation: OFFBOARD begins above it and ends before a landing. Not of one that falls.
     """
     rows, seconds = _rows(ls, began_s)
     p = rows["position_ned_m"]
     level, height = np.hypot(p[:, :, 0], p[:, :, 1]), -p[:, :, 2]
     beyond = np.max([level - flight.fence_radius_m, height - flight.fence_ceiling_m, flight.fence_floor_m - height], 0)
     ours = (rows["custom_mode"] == Px4Mode.OFFBOARD) & (rows["landed_state"] != ON_GROUND)
-    judged = ours & (seconds[:, None] < _since(list(ls.vehicles), faults, ESTIMATE_FAULTS)[None, :])
+    judged = ours & (seconds[:, None] < _since(list(ls.vehicles), faults, ESTIMATE_FAULTS | FALLS)[None, :])
     return {"beyond_fence_m": float(np.where(judged, beyond, -np.inf).max())}
 
 

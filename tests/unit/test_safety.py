@@ -16,6 +16,7 @@ from companion.core.frames import Ned
 from companion.core.safety import (
     COLLISION_DISTANCE_M,
     DOWNWASH_RATIO,
+    FENCE_ID,
     LAG_ALLOWANCE_M,
     POLE_PER_S,
     TOLERANCE_M2_S2,
@@ -620,6 +621,19 @@ def test_between_two_that_come_nearer_it_stays_in_the_middle() -> None:
     s = applied(f, command(Ned(3.0, 0.0, 0.0)), state(), closing)
     assert f.counts["peer distance not attainable"] == 1
     assert s.acceleration_north_m_s2 == pytest.approx(0.0, abs=0.05)
+
+
+def test_edges_that_meet_in_one_point_to_the_tolerance_are_kept_to_the_tolerance() -> None:
+    """From this command `project` finds no point, from zero it does: what it gave up at must not be flown to."""
+    u, ego = (-5.4, -3.3), state()
+    edges = [
+        HalfPlane(-1.99, -0.21, 9.0529, FENCE_ID),
+        HalfPlane(-2.21, -5.58, 33.6629, FENCE_ID),
+        HalfPlane(0.37, 0.93, -5.6165, FENCE_ID),
+    ]
+    assert not nearest_feasible(*u, edges)[2]
+    assert nearest_feasible(0.0, 0.0, edges)[2]
+    assert missed(SafetyFilter(LIMITS)._kept(u, [], edges, ego, []), edges) <= 2 * TOLERANCE_M2_S2
 
 
 @PROPERTY
