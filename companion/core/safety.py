@@ -399,7 +399,7 @@ class SafetyFilter:
         gentlest = nearest_feasible(0.0, 0.0, planes)
         if gentlest[2] and hypot(gentlest[0], gentlest[1]) <= most:
             if not met:
-                # Edges that miss a common point by less than the tolerance: what is found from zero is not found from u.
+                # Edges that miss a common point by less than the tolerance: found from zero, not from u.
                 return gentlest[0], gentlest[1]
             # What lies between two commands that keep everything keeps it too.
             self._acted.add("acceleration")
