@@ -5,21 +5,26 @@ from typing import Any
 
 import numpy as np
 import pytest
-from flights import check_setpoint, fleet
+from flights import check_setpoint, distances, fleet, truth
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
 from companion.core.failsafe import Failsafe
+from companion.core.safety import COLLISION_DISTANCE_M
 from companion.core.values import FLYING_PHASES, Instant, Phase
+from companion.flight import ON_GROUND
 from companion.wire.mavlink import Px4Mode
-from sim.lockstep import Lockstep
+from sim.lockstep import UTC_AT_START_NS, Lockstep
 from sim.px4.faults import Fault, FaultKind
 
 pytestmark = pytest.mark.timeout(600)
 """flights are simulated within a test, on whatever machine"""
 
 IDS = st.sampled_from([1, 2])
+BLINDING = (FaultKind.GPS_LOST, FaultKind.POSITION_FROZEN, FaultKind.ESTIMATOR_RESET, FaultKind.NOISE)
+"""after these nobody can know where the vehicle truly is"""
+FENCE = {"radius_m": 15.0, "floor_m": 1.0, "ceiling_m": 8.0}
 ENDED_S = 120.0
 
 
@@ -27,11 +32,13 @@ def brief(tables: dict[str, Any]) -> None:
     tables["trigger"]["t_max_s"] = 2.0
     tables["peers"].update(isolated_flight_s=2.0, wait_s=8.0)
     tables["failsafe"]["isolated_hold_s"] = 3.0
+    tables["fence"] = FENCE
     tables["plan"].update(then="return", legs=[{"kind": "velocity", "north_m_s": 1.0, "duration_s": 3.0}])
 
 
 class AnyFaults(RuleBasedStateMachine):
-    """Finite setpoints within limits; none to an autopilot that left OFFBOARD by another's will; an end."""
+    """Finite setpoints within limits; none to an autopilot that left OFFBOARD by another's will; distance and fence
+    kept by whoever may know where it is; an end."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -39,6 +46,10 @@ class AnyFaults(RuleBasedStateMachine):
         self.setpoints: dict[int, list[float]] = {1: [], 2: []}
         self.taken: dict[int, float] = {}
         """when the pilot took a vehicle that nobody resumed since (s)"""
+        self.blind: dict[int, float] = {}
+        """since when nobody can know where a vehicle is (s)"""
+        self.falling: dict[int, float] = {}
+        """since when a vehicle's motors stand (s)"""
 
     @initialize(seed=st.integers(0, 5))
     def take_off(self, seed: int) -> None:
@@ -61,13 +72,13 @@ class AnyFaults(RuleBasedStateMachine):
 
     @rule(
         i=IDS,
-        kind=st.sampled_from(
-            [FaultKind.GPS_LOST, FaultKind.POSITION_FROZEN, FaultKind.ESTIMATOR_RESET, FaultKind.NOISE, FaultKind.MUTE]
-        ),
+        kind=st.sampled_from([*BLINDING, FaultKind.MUTE]),
         duration_s=st.sampled_from([0.4, 1.0, 4.0]),
     )
     def break_autopilot(self, i: int, kind: FaultKind, duration_s: float) -> None:
         self.ls.vehicles[i].autopilot.inject(Fault(kind, duration_s=duration_s))
+        if kind in BLINDING:
+            self.blind.setdefault(i, self.seconds)
 
     @rule(i=IDS, fraction=st.sampled_from([0.08, 0.2]))
     def drain(self, i: int, fraction: float) -> None:
@@ -88,8 +99,11 @@ class AnyFaults(RuleBasedStateMachine):
     def command(self, verb: str, i: int) -> None:
         answers = self.ls.command(json.dumps({"verb": verb, "confirm": True}).encode(), i)
         for answer in answers.values():
-            if verb == "resume" and json.loads(answer)["accepted"]:
+            accepted = json.loads(answer)["accepted"]
+            if verb == "resume" and accepted:
                 self.taken.pop(i, None)
+            if verb == "kill" and accepted:
+                self.falling.setdefault(i, self.seconds)
 
     @rule(i=IDS)
     def kill_process(self, i: int) -> None:
@@ -134,7 +148,22 @@ class AnyFaults(RuleBasedStateMachine):
             if v.alive:
                 assert v.agent.phase in (Phase.LANDED, Phase.RELEASED, Phase.IDLE), v.agent.phase
         self.no_setpoint_after_a_takeover()
-        assert np.isfinite(ls.truth()["position_ned_m"]).all()
+        self.distance_and_fence_were_kept()
+
+    def distance_and_fence_were_kept(self) -> None:
+        t = truth(self.ls)
+        assert np.isfinite(t.position_ned_m).all()
+        seconds = (t.times_ns - UTC_AT_START_NS) * 1e-9
+        aloft = t.landed_state != ON_GROUND
+        known = seconds < min(self.blind.values(), default=np.inf)
+        assert distances(t)[known & aloft.any(axis=1)].min(initial=np.inf) >= COLLISION_DISTANCE_M
+        ours = aloft & (t.mode == Px4Mode.OFFBOARD)
+        for k, i in enumerate(t.ids):
+            since_s = min(self.blind.get(i, np.inf), self.falling.get(i, np.inf))
+            p = t.position_ned_m[ours[:, k] & (seconds < since_s), k]
+            assert np.hypot(p[:, 0], p[:, 1]).max(initial=0.0) <= FENCE["radius_m"]
+            assert (-p[:, 2]).max(initial=0.0) <= FENCE["ceiling_m"]
+            assert (-p[:, 2]).min(initial=np.inf) >= FENCE["floor_m"]
 
 
 AnyFaults.TestCase.settings = settings(
