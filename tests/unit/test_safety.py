@@ -686,7 +686,7 @@ def test_a_blocked_vehicle_passes_the_one_that_blocks_it_most() -> None:
     ("u", "most", "less"),
     [
         # Nearer, so that in m^2/s^2 its edge is missed by less than the other's.
-        ((-3.0, 3.0), peer(Ned(-0.8, 0.8, 0.0)), peer(Ned(-3.0, -0.5, 0.0), Ned(1.7, 0.28, 0.0), vehicle_id=3)),
+        ((-3.0, -3.0), peer(Ned(-0.8, -0.8, 0.0)), peer(Ned(-3.0, 0.5, 0.0), Ned(1.7, -0.28, 0.0), vehicle_id=3)),
         ((-3.0, 3.0), peer(Ned(-0.8, 0.8, 0.0)), peer(Ned(0.5, 3.0, 0.0), Ned(-0.28, -1.7, 0.0), vehicle_id=3)),
         # Nearly above.
         ((2.0, 2.0), peer(Ned(0.2, 0.2, -2.4)), peer(Ned(3.0, -0.5, 0.0), Ned(-2.1, 0.35, 0.0), vehicle_id=3)),
