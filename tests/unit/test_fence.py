@@ -335,6 +335,19 @@ def test_of_what_keeps_the_peer_the_command_that_misses_the_fence_least_is_flown
     assert f.counts["peer distance not attainable"] == 0
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_peer_that_takes_nearly_the_whole_acceleration_is_avoided_beyond_the_margin(axis: int) -> None:
+    def along(x: float, down: float = 0.0) -> Ned:
+        return Ned(x, 0.0, down) if axis == 0 else Ned(0.0, x, down)
+
+    f = with_fence(SQUARE)
+    s = applied(f, command(), state(along(28.0, LEVEL_M)), (peer(along(25.9, LEVEL_M), along(4.8)),))
+    needed = (-(4.8**2) + 5.0 * 4.8 * 2.1 - 3.125 * (2.1**2 - 1.0)) / 2.1
+    assert 7.95 < needed < 8.0
+    assert acceleration(s) == pytest.approx(tuple(along(needed))[:2], abs=1e-3)
+    assert f.counts == {"peer distance": 1, "fence not attainable": 1}
+
+
 @pytest.mark.parametrize(("miss", "counted"), [(0.0095, 0), (0.0105, 1), (0.5, 1)])
 def test_a_fence_missed_by_a_hundredth_of_a_m_s2_is_counted(miss: float, counted: int) -> None:
     place = Ned(28.0 - (7.3125 - miss) / 2.25, 0.0, LEVEL_M)

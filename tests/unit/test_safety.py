@@ -244,6 +244,14 @@ def test_full_share_is_taken_toward_a_peer_that_does_not_avoid() -> None:
     assert whole[:2] == half[:2] == pytest.approx((-4.0, -1.0))
 
 
+def test_toward_a_peer_that_shares_the_command_counts_from_the_mean_of_both_slots() -> None:
+    ego, mean = state(velocity=Ned(1.0, 0.0, 0.0)), Ned(0.5, -0.75, 0.0)
+    own, theirs = Ned(2.0, -1.0, 0.0), Ned(-1.0, -0.5, 0.0)
+    n = peer(Ned(2.0, 0.5, 0.0), shares=True, reference_acceleration_ned_m_s2=theirs)
+    resting, moving = half_plane(ego, ZERO, n._replace(reference_acceleration_ned_m_s2=ZERO)), half_plane(ego, own, n)
+    assert moving.b - resting.b == pytest.approx(moving.g_north * mean.north + moving.g_east * mean.east)
+
+
 def test_safety_radius_is_collision_lag_and_uncertainty() -> None:
     assert safety_radius_m(0.35) == pytest.approx(1.0)
     assert safety_radius_m(0.0) == pytest.approx(0.65)
@@ -391,6 +399,29 @@ def test_leaving_out_what_is_out_of_reach_changes_no_setpoint(
 @pytest.mark.parametrize("place", [inf, nan, 1e7, 1e160])
 def test_a_peer_at_no_place_is_never_out_of_reach(place: float) -> None:
     assert not out_of_reach(state(), ZERO, peer(Ned(place, 0.0, 0.0)), 8.0)
+
+
+@pytest.mark.parametrize("way", [(1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 2.5), (0.48, 0.64, -1.5)])
+@pytest.mark.parametrize(
+    ("own", "theirs", "shares", "reach"),
+    [
+        (ZERO, ZERO, False, 1.0 + 16.0 / 6.25),
+        (Ned(2.0, 1.0, 0.0), Ned(-1.0, -3.0, 0.0), False, 1.0 + (10.0 * 5.0 + 16.0) / 6.25),
+        (Ned(0.0, 0.0, 4.0), Ned(0.0, 0.0, -1.0), False, 1.0 + (10.0 * 2.0 + 16.0) / 6.25),
+        (ZERO, ZERO, True, 1.0 + 4.0 * (8.0 + 2.5) / 6.25),
+        (Ned(2.0, 1.0, 0.0), Ned(-1.0, -3.0, 0.0), True, 1.0 + (10.0 * 5.0 + 4.0 * (8.0 + 2.5)) / 6.25),
+    ],
+)
+def test_the_reach_is_the_safety_radius_and_what_braking_takes(
+    own: Ned, theirs: Ned, shares: bool, reach: float, way: tuple[float, float, float]
+) -> None:
+    """d + (4 p w + k)/p^2 with p = 2.5 /s; k is 2 U, or 4 (U + S) with S the mean of what both plans ask."""
+    asked, asked_of_peer = Ned(1.0, 2.0, 0.0), Ned(2.0, 2.0, 0.0)
+    for share, beyond in ((1.0 - 1e-9, False), (1.0 + 1e-9, True)):
+        n = peer(
+            Ned(*(share * reach * x for x in way)), theirs, shares=shares, reference_acceleration_ned_m_s2=asked_of_peer
+        )
+        assert out_of_reach(state(velocity=own), asked, n, 8.0) is beyond
 
 
 @pytest.mark.parametrize(("place", "left_out"), [(999_999.0, True), (1e6, False), (1_000_001.0, False)])
