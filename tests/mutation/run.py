@@ -207,6 +207,7 @@ def survivors_outside(copy: Path) -> tuple[int, list[Mutant]]:
             (copy / path).write_text(text, encoding="utf-8")
             if passes(copy, path):
                 survived.append(mutant)
+                typer.echo(f"\rsurvived: {mutant}")
             count += 1
             if sys.stdout.isatty() or count % 25 == 0:
                 typer.echo(f"\r{count} outside functions, {len(survived)} survived", nl=not sys.stdout.isatty())

@@ -358,6 +358,20 @@ def test_a_fence_missed_by_a_hundredth_of_a_m_s2_is_counted(miss: float, counted
     assert f.counts["fence not attainable"] == counted
 
 
+def test_between_two_peers_that_cannot_both_be_avoided_the_fence_is_still_kept_where_it_costs_them_nothing() -> None:
+    """They close in from both sides; braking before the fence, at 3 /s of 1 m/s, brings neither nearer."""
+    ego = state(Ned(28.0, 0.0, LEVEL_M), Ned(1.0, 0.0, 0.0))
+    sides = (
+        peer(Ned(28.0, 0.9, LEVEL_M), Ned(1.0, -1.5, 0.0), 2),
+        peer(Ned(28.0, -0.9, LEVEL_M), Ned(1.0, 1.5, 0.0), 3),
+    )
+    f = with_fence(SQUARE)
+    s = applied(f, command(), ego, sides)
+    assert acceleration(s) == pytest.approx((-3.0, 0.0), abs=0.01)
+    assert f.counts["peer distance not attainable"] == 1
+    assert f.counts["fence not attainable"] == 0
+
+
 def test_where_neither_can_be_kept_the_peers_miss_no_more_than_without_a_fence() -> None:
     ego = state(Ned(28.5, 0.0, LEVEL_M))
     crowd = (
