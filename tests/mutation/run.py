@@ -157,7 +157,7 @@ def survivors_inside(copy: Path, jobs: int, names: list[str]) -> tuple[int, list
         name: state
         for line in run([*mutmut, "results", "--all", "true"], copy).stdout.splitlines()
         for name, state in [line.strip().split(": ")]
-        if state != "not checked"
+        if not (names and state == "not checked")
     }
     undecided = sorted(name for name, state in of.items() if state not in ("killed", "timeout", "survived"))
     if undecided:
