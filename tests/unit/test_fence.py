@@ -219,6 +219,28 @@ def test_toward_the_fence_the_allowed_push_falls_with_the_speed(speed: float, al
     assert f.counts["fence not attainable"] == (1 if speed == 4.0 else 0)
 
 
+@pytest.mark.parametrize(
+    ("place", "velocity", "wanted", "flown"),
+    [
+        ((28.0, 28.0), (1.0, 4.0 / 3.0), (0.0, -8.0), (-3.0, -sqrt(55.0))),
+        ((28.0, 28.0), (4.0 / 3.0, 1.0), (-8.0, 0.0), (-sqrt(55.0), -3.0)),
+        # Nearly all of it is needed.
+        ((28.0, 28.0), (1.0, 7.4 / 3.0), (-2.4, -7.6), (-3.0, -sqrt(55.0))),
+        ((28.0, 28.0), (7.4 / 3.0, 1.0), (-7.6, -2.4), (-sqrt(55.0), -3.0)),
+        ((28.0, 0.0), (7.96 / 3.0, 0.0), (0.0, 8.0), (-7.96, sqrt(64.0 - 7.96**2))),
+        ((0.0, 28.0), (0.0, 7.96 / 3.0), (8.0, 0.0), (sqrt(64.0 - 7.96**2), -7.96)),
+    ],
+)
+def test_braking_comes_first_and_what_is_wanted_fills_the_acceleration_limit(
+    place: tuple[float, float], velocity: tuple[float, float], wanted: tuple[float, float], flown: tuple[float, float]
+) -> None:
+    """At the margin a wall asks for 3 /s of the speed toward it; what is wanted leads along it."""
+    f = with_fence(SQUARE, jerk_max_m_s3=1e9)
+    s = applied(f, command(Ned(*wanted, 0.0)), state(Ned(*place, LEVEL_M), Ned(*velocity, 0.0)))
+    assert acceleration(s) == pytest.approx(flown)
+    assert f.counts == {"fence": 1, "acceleration": 1}
+
+
 def test_braking_at_the_fence_is_not_delayed_by_jerk() -> None:
     f = with_fence(SQUARE, jerk_max_m_s3=0.1)
     f.acceleration_m_s2 = (2.0, 0.0)
@@ -283,6 +305,71 @@ def test_a_vehicle_pressed_to_the_fence_by_a_peer_avoids_the_peer_and_misses_the
     assert s.acceleration_north_m_s2 == pytest.approx(needed, abs=0.02)
     assert s.acceleration_north_m_s2 >= needed - 1e-3
     assert f.counts == {"peer distance": 1, "fence not attainable": 1}
+
+
+@pytest.mark.parametrize(("angle", "room"), [(pi / 6, 0.0), (pi / 6, 1.5), (-pi / 6, 0.0), (0.09, 2.9), (-0.09, 2.9)])
+@pytest.mark.parametrize("wall", [(-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0)], ids=["N", "S", "E", "W"])
+def test_of_what_keeps_the_peer_the_command_that_misses_the_fence_least_is_flown(
+    angle: float, room: float, wall: tuple[float, float]
+) -> None:
+    """The one on the peer's edge, as far along it as the acceleration limit allows."""
+    out, along = (-wall[0], -wall[1]), (-wall[1], wall[0])
+    away = Ned(out[0] * cos(angle) + along[0] * sin(angle), out[1] * cos(angle) + along[1] * sin(angle), 0.0)
+    place = Ned((28.0 - room) * out[0], (28.0 - room) * out[1], LEVEL_M)
+    closing = peer(
+        Ned(place.north - 2.0 * away.north, place.east - 2.0 * away.east, LEVEL_M),
+        Ned(4.0 * away.north, 4.0 * away.east, 0.0),
+    )
+    plane = half_plane(state(place), ZERO, closing)
+    needed = plane.b / hypot(plane.g_north, plane.g_east)
+    assert needed == pytest.approx(7.3125)
+    f = with_fence(SQUARE)
+    s = applied(f, command(), state(place), (closing,))
+    beside = sqrt(64.0 - needed**2) * (1.0 if angle > 0.0 else -1.0)
+    outward = needed * cos(angle) - beside * sin(angle)
+    assert outward > 2.25 * room + 0.1, "the fence is missed by this much"
+    u = acceleration(s)
+    assert u[0] * out[0] + u[1] * out[1] == pytest.approx(outward, abs=0.02)
+    assert u[0] * along[0] + u[1] * along[1] == pytest.approx(needed * sin(angle) + beside * cos(angle), abs=0.1)
+    assert f.counts["fence not attainable"] == 1
+    assert f.counts["peer distance not attainable"] == 0
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_peer_that_takes_nearly_the_whole_acceleration_is_avoided_beyond_the_margin(axis: int) -> None:
+    def along(x: float, down: float = 0.0) -> Ned:
+        return Ned(x, 0.0, down) if axis == 0 else Ned(0.0, x, down)
+
+    f = with_fence(SQUARE)
+    s = applied(f, command(), state(along(28.0, LEVEL_M)), (peer(along(25.9, LEVEL_M), along(4.8)),))
+    needed = (-(4.8**2) + 5.0 * 4.8 * 2.1 - 3.125 * (2.1**2 - 1.0)) / 2.1
+    assert 7.95 < needed < 8.0
+    assert acceleration(s) == pytest.approx(tuple(along(needed))[:2], abs=1e-3)
+    assert f.counts == {"peer distance": 1, "fence not attainable": 1}
+
+
+@pytest.mark.parametrize(("miss", "counted"), [(0.0095, 0), (0.0105, 1), (0.5, 1)])
+def test_a_fence_missed_by_a_hundredth_of_a_m_s2_is_counted(miss: float, counted: int) -> None:
+    place = Ned(28.0 - (7.3125 - miss) / 2.25, 0.0, LEVEL_M)
+    closing = peer(Ned(place.north - 2.0, 0.0, LEVEL_M), Ned(4.0, 0.0, 0.0))
+    f = with_fence(SQUARE)
+    s = applied(f, command(), state(place), (closing,))
+    assert s.acceleration_north_m_s2 == pytest.approx(7.3125, abs=1e-3)
+    assert f.counts["fence not attainable"] == counted
+
+
+def test_between_two_peers_that_cannot_both_be_avoided_the_fence_is_still_kept_where_it_costs_them_nothing() -> None:
+    """They close in from both sides; braking before the fence, at 3 /s of 1 m/s, brings neither nearer."""
+    ego = state(Ned(28.0, 0.0, LEVEL_M), Ned(1.0, 0.0, 0.0))
+    sides = (
+        peer(Ned(28.0, 0.9, LEVEL_M), Ned(1.0, -1.5, 0.0), 2),
+        peer(Ned(28.0, -0.9, LEVEL_M), Ned(1.0, 1.5, 0.0), 3),
+    )
+    f = with_fence(SQUARE)
+    s = applied(f, command(), ego, sides)
+    assert acceleration(s) == pytest.approx((-3.0, 0.0), abs=0.01)
+    assert f.counts["peer distance not attainable"] == 1
+    assert f.counts["fence not attainable"] == 0
 
 
 def test_where_neither_can_be_kept_the_peers_miss_no_more_than_without_a_fence() -> None:
@@ -397,11 +484,11 @@ def test_without_a_fence_altitude_passes_as_it_is() -> None:
     ("bias", "used", "acted"),
     [(0.999, 0.999, 0), (1.0, 1.0, 0), (1.001, 1.0, 1), (1e30, 1.0, 1), (-0.999, -0.999, 0), (-1.001, -1.0, 1)],
 )
-@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("axis", [0, 1, 2])
 def test_the_velocity_bias_sent_is_bounded(bias: float, used: float, acted: int, axis: int) -> None:
     f = with_fence(None)
     s = applied(f, command(), state(ZERO), bias=Ned(*(bias if k == axis else 0.0 for k in range(3))))
-    assert (s.velocity_north_m_s, s.velocity_east_m_s)[axis] == used
+    assert (s.velocity_north_m_s, s.velocity_east_m_s, s.velocity_down_m_s)[axis] == used
     assert f.counts["velocity bias"] == acted
 
 

@@ -28,6 +28,7 @@ from companion.core.safety import (
     nearest_hypothesis,
     out_of_reach,
     safety_radius_m,
+    sidestep,
 )
 from companion.core.values import Command, Neighbour, SafeSetpoint, VehicleState
 
@@ -148,6 +149,7 @@ def test_order_of_half_planes_does_not_matter(
         ((0.0, 0.0), [(2.0, 0.0, 2.0), (0.0, 2.0, 4.0)], (1.0, 2.0, True)),  # a corner
         ((0.0, 0.0), [(1.0, 0.0, 2.0), (1.0, 0.0, 2.0), (3.0, 0.0, 6.0)], (2.0, 0.0, True)),  # the same edge thrice
         ((0.0, 0.0), [(1.0, 0.0, 1.0), (-1.0, 0.0, -1.0)], (1.0, 0.0, True)),  # a line
+        ((0.0, 0.0), [(1.0, 0.0, 1.0), (-1.0, 0.0, -1.0), (0.0, 1.0, 2.0), (0.0, -1.0, -2.0)], (1.0, 2.0, True)),
     ],
 )
 def test_nearest_feasible_of_known_cases(
@@ -158,8 +160,24 @@ def test_nearest_feasible_of_known_cases(
     assert met is expected[2]
 
 
-def test_opposed_half_planes_are_not_attainable() -> None:
-    assert not nearest_feasible(0.0, 0.0, [HalfPlane(1.0, 0.0, 2.0, 2), HalfPlane(-1.0, 0.0, -1.0, 3)])[2]
+@pytest.mark.parametrize(
+    "planes",
+    [
+        [(1.0, 0.0, 2.0), (-1.0, 0.0, -1.0)],
+        [(1.0, 0.0, 1.0), (-0.6, 0.8, 1.0), (-0.6, -0.8, 1.0)],  # a triangle inside out
+    ],
+)
+def test_opposed_half_planes_are_not_attainable(planes: list[tuple[float, float, float]]) -> None:
+    assert nearest_feasible(0.0, 0.0, [HalfPlane(*p, 2) for p in planes])[2] is False
+
+
+@pytest.mark.parametrize(("less", "north"), [(0.00095, 0.99905), (0.00105, 1.0)])
+def test_a_command_stays_that_misses_an_edge_by_no_more_than_the_tolerance(less: float, north: float) -> None:
+    assert nearest_feasible(1.0 - less, 0.0, [HalfPlane(1.0, 0.0, 1.0, 2)]) == (
+        pytest.approx(north, abs=1e-9),
+        0.0,
+        True,
+    )
 
 
 # -- the barrier -----------------------------------------------------------------------------------------------------
@@ -210,11 +228,29 @@ def test_halves_of_a_pair_make_up_the_whole_barrier_whatever_the_plan_asks_of_ea
     assert slack == pytest.approx(barrier_condition(state(p, v), peer(q, w), *u), abs=1e-3, rel=1e-5)
 
 
+@pytest.mark.parametrize(
+    ("north", "closing", "b"),
+    [(1.0, 0.0, 0.0), (2.0, 0.0, -18.75), (2.0, 1.0, -0.75), (2.0, 3.0, 23.25), (0.5, 0.0, 4.6875), (1.0, -1.0, -12.0)],
+)
+def test_the_barriers_poles_are_at_2_5_per_second(north: float, closing: float, b: float) -> None:
+    """-(h'' + 5 h' + 6.25 h) of a peer that flies straight on, h = |x|^2 - (1 m)^2."""
+    plane = half_plane(state(), ZERO, peer(Ned(north, 0.0, 0.0), Ned(-closing, 0.0, 0.0), vehicle_id=7))
+    assert plane == pytest.approx((-2.0 * north, 0.0, b, 7))
+
+
 def test_full_share_is_taken_toward_a_peer_that_does_not_avoid() -> None:
     ego = state(velocity=Ned(1.0, 0.0, 0.0))
     half, whole = (half_plane(ego, ZERO, peer(Ned(2.0, 0.5, 0.0), shares=shares)) for shares in (True, False))
     assert whole.b == pytest.approx(2.0 * half.b)
     assert whole[:2] == half[:2] == pytest.approx((-4.0, -1.0))
+
+
+def test_toward_a_peer_that_shares_the_command_counts_from_the_mean_of_both_slots() -> None:
+    ego, mean = state(velocity=Ned(1.0, 0.0, 0.0)), Ned(0.5, -0.75, 0.0)
+    own, theirs = Ned(2.0, -1.0, 0.0), Ned(-1.0, -0.5, 0.0)
+    n = peer(Ned(2.0, 0.5, 0.0), shares=True, reference_acceleration_ned_m_s2=theirs)
+    resting, moving = half_plane(ego, ZERO, n._replace(reference_acceleration_ned_m_s2=ZERO)), half_plane(ego, own, n)
+    assert moving.b - resting.b == pytest.approx(moving.g_north * mean.north + moving.g_east * mean.east)
 
 
 def test_safety_radius_is_collision_lag_and_uncertainty() -> None:
@@ -255,6 +291,35 @@ def test_flying_along_a_lost_peers_segment_carries_nobody_away_from_it(ego: Ned,
     )
     slack = plane.g_north * u.north + plane.g_east * u.east - plane.b
     assert slack == pytest.approx(wall, abs=1e-3, rel=1e-5)
+
+
+@PROPERTY
+@given(vectors, vectors, vectors, vectors, level)
+def test_beside_a_slanted_segment_the_barrier_is_that_of_its_line(p: Ned, v: Ned, a: Ned, b: Ned, u: Ned) -> None:
+    """h'' + 5 h' + 6.25 h of the distance to the line, vertical lengths divided by the downwash, numerically."""
+    scale = np.array([1.0, 1.0, 1.0 / DOWNWASH_RATIO])
+    way = (np.array(b) - np.array(a)) * scale
+    assume(np.linalg.norm(way) > 0.5)
+
+    def across(t: float) -> np.ndarray:
+        x = (np.array(p) + t * np.array(v) + 0.5 * t * t * np.array(u) - np.array(a)) * scale
+        return x - way * (x @ way) / (way @ way)
+
+    share = ((np.array(p) - np.array(a)) * scale) @ way / (way @ way)
+    assume(0.01 < share < 0.99)
+    assume(hypot(*across(0.0)[:2]) > 0.01)
+    step = 1e-3
+    h0, h1, h2 = (float(across(t) @ across(t)) - 1.0 for t in (0.0, step, -step))
+    whole = (h1 + h2 - 2 * h0) / step**2 + 5.0 * (h1 - h2) / (2 * step) + 6.25 * h0
+    plane = half_plane(state(p, v), ZERO, peer(a, other_end_ned_m=b))
+    assert plane.g_north * u.north + plane.g_east * u.east - plane.b == pytest.approx(whole, abs=1e-3, rel=1e-4)
+
+
+@pytest.mark.parametrize(("north", "end", "moves"), [(21.0, 20.0, 0.5), (-21.0, -20.0, 0.0)])
+def test_beyond_its_ends_a_lost_peers_segment_is_the_place_of_the_end(north: float, end: float, moves: float) -> None:
+    ego = state(Ned(north, 0.4, 0.0), Ned(-1.0, 0.3, 0.0))
+    lost = peer(Ned(20.0, 0.0, 0.0), Ned(0.5, 0.0, 0.0), other_end_ned_m=Ned(-20.0, 0.0, 0.0))
+    assert half_plane(ego, ZERO, lost) == half_plane(ego, ZERO, peer(Ned(end, 0.0, 0.0), Ned(moves, 0.0, 0.0)))
 
 
 def test_a_lost_peer_whose_ends_meet_has_one_place() -> None:
@@ -337,6 +402,34 @@ def test_a_peer_at_no_place_is_never_out_of_reach(place: float) -> None:
     assert not out_of_reach(state(), ZERO, peer(Ned(place, 0.0, 0.0)), 8.0)
 
 
+@pytest.mark.parametrize("way", [(1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 2.5), (0.48, 0.64, -1.5)])
+@pytest.mark.parametrize(
+    ("own", "theirs", "shares", "reach"),
+    [
+        (ZERO, ZERO, False, 1.0 + 16.0 / 6.25),
+        (Ned(2.0, 1.0, 0.0), Ned(-1.0, -3.0, 0.0), False, 1.0 + (10.0 * 5.0 + 16.0) / 6.25),
+        (Ned(0.0, 0.0, 4.0), Ned(0.0, 0.0, -1.0), False, 1.0 + (10.0 * 2.0 + 16.0) / 6.25),
+        (ZERO, ZERO, True, 1.0 + 4.0 * (8.0 + 2.5) / 6.25),
+        (Ned(2.0, 1.0, 0.0), Ned(-1.0, -3.0, 0.0), True, 1.0 + (10.0 * 5.0 + 4.0 * (8.0 + 2.5)) / 6.25),
+    ],
+)
+def test_the_reach_is_the_safety_radius_and_what_braking_takes(
+    own: Ned, theirs: Ned, shares: bool, reach: float, way: tuple[float, float, float]
+) -> None:
+    """d + (4 p w + k)/p^2 with p = 2.5 /s; k is 2 U, or 4 (U + S) with S the mean of what both plans ask."""
+    asked, asked_of_peer = Ned(1.0, 2.0, 0.0), Ned(2.0, 2.0, 0.0)
+    for share, beyond in ((1.0 - 1e-9, False), (1.0 + 1e-9, True)):
+        n = peer(
+            Ned(*(share * reach * x for x in way)), theirs, shares=shares, reference_acceleration_ned_m_s2=asked_of_peer
+        )
+        assert out_of_reach(state(velocity=own), asked, n, 8.0) is beyond
+
+
+@pytest.mark.parametrize(("place", "left_out"), [(999_999.0, True), (1e6, False), (1_000_001.0, False)])
+def test_a_peer_a_thousand_kilometres_away_is_looked_at_in_full(place: float, left_out: bool) -> None:
+    assert out_of_reach(state(), ZERO, peer(Ned(0.0, place, 0.0)), 8.0) is left_out
+
+
 @pytest.mark.parametrize("above", [0.0, 1e-6, 0.3, -0.3])
 def test_two_vehicles_exactly_above_one_another_leave_in_opposite_directions(above: float) -> None:
     upper, lower = Ned(5.0, 5.0, -10.0 - above), Ned(5.0, 5.0, -10.0)
@@ -373,6 +466,18 @@ def test_a_state_or_reference_that_is_not_finite_gives_no_setpoint(bad: float, f
     assert f.apply(c, ego, [peer(Ned(1.5, 0.0, 0.0))], bias, bad if field == "dt" else DT_S) is None
     assert f.counts == {"not finite": 1}
     assert f.apply(command(), state(), [], ZERO, DT_S) is not None  # and nothing of it stays
+    assert f.apply(c, ego, [], bias, bad if field == "dt" else DT_S) is None
+    assert f.counts == {"not finite": 2}
+
+
+def test_finite_numbers_whose_products_are_not_give_no_setpoint_and_nothing_of_them_stays() -> None:
+    f = SafetyFilter(LIMITS)
+    for ticks in (1, 2):
+        assert f.apply(command(), state(velocity=Ned(1e308, 0.0, 0.0)), [], ZERO, DT_S) is None
+        assert f.counts["not finite"] == ticks
+    s = applied(f, command(), state(velocity=Ned(0.5, 0.0, 0.0)))
+    assert acceleration(s) == (0.0, 0.0)
+    assert s.velocity_north_m_s == 0.5
 
 
 @pytest.mark.parametrize("bad", [nan, inf, -inf])
@@ -398,8 +503,8 @@ def test_a_peer_that_is_not_finite_makes_it_brake_and_the_others_are_kept_apart_
         reference_acceleration_ned_m_s2=broken if field == "reference" else ZERO,
     )
     f = SafetyFilter(LIMITS)
-    s = applied(f, command(Ned(3.0, 0.0, 0.0)), state(velocity=Ned(1.0, 0.0, 0.0)), [strange])
-    assert acceleration(s) == (-1.0, 0.0)
+    s = applied(f, command(Ned(3.0, 0.0, 0.0)), state(velocity=Ned(1.0, -0.5, 0.0)), [strange])
+    assert acceleration(s) == (-1.0, 0.5)
     assert f.counts == {"peer not finite: braking": 1}
     ahead = peer(Ned(1.1, 0.0, 0.0), vehicle_id=3)
     s = applied(f, command(Ned(3.0, 0.0, 0.0)), state(velocity=Ned(1.0, 0.0, 0.0)), [strange, ahead])
@@ -499,10 +604,11 @@ def test_a_command_forward_for_ever_ends_at_the_speed_limit() -> None:
 @pytest.mark.parametrize(
     ("change", "flown", "acted"), [(0.599, 0.599, 0), (0.6, 0.6, 0), (0.601, 0.6, 1), (5.0, 0.6, 1), (-5.0, -0.6, 1)]
 )
-def test_jerk_at_its_limit(change: float, flown: float, acted: int) -> None:
-    f = settled(LIMITS, (1.0, -1.0))
-    s = applied(f, command(Ned(1.0, -1.0 + change, 0.0)), state())
-    assert acceleration(s) == pytest.approx((1.0, -1.0 + flown))
+@pytest.mark.parametrize(("north", "east"), [(0.0, 1.0), (1.0, 0.0), (0.6, -0.8)])
+def test_jerk_at_its_limit(change: float, flown: float, acted: int, north: float, east: float) -> None:
+    f = settled(LIMITS, (-1.0, -1.0))
+    s = applied(f, command(Ned(-1.0 + change * north, -1.0 + change * east, 0.0)), state())
+    assert acceleration(s) == pytest.approx((-1.0 + flown * north, -1.0 + flown * east))
     assert f.counts["jerk"] == acted
 
 
@@ -542,6 +648,23 @@ def test_bias_goes_back_into_the_velocities_sent() -> None:
     assert s.velocity_down_m_s == pytest.approx(0.25)
 
 
+def test_the_velocity_sent_leads_the_measured_one_by_the_acceleration() -> None:
+    f = settled(replace(LIMITS, jerk_max_m_s3=1e9))
+    c, ego = command(Ned(0.5, -0.25, 0.0)), state(velocity=Ned(1.0, 2.0, 0.0))
+    first, second = applied(f, c, ego), applied(f, c, ego)
+    assert (first.velocity_north_m_s, first.velocity_east_m_s) == pytest.approx((1.01, 1.995))
+    # The lead of the step before has leaked by 0.02 s / 1 s.
+    assert (second.velocity_north_m_s, second.velocity_east_m_s) == pytest.approx((1.0198, 1.9901))
+
+
+def test_above_the_speed_limit_the_limit_is_sent_even_while_braking() -> None:
+    f = settled(replace(LIMITS, jerk_max_m_s3=1e9))
+    s = applied(f, command(Ned(-0.6, -0.8, 0.0)), state(velocity=Ned(1.86, 2.48, 0.0)))
+    assert acceleration(s) == pytest.approx((-0.6, -0.8))
+    assert (s.velocity_north_m_s, s.velocity_east_m_s) == pytest.approx((1.8, 2.4))
+    assert f.counts == {"speed": 1}
+
+
 def test_altitude_and_yaw_pass_as_they_are() -> None:
     s = applied(SafetyFilter(LIMITS), command(place=Ned(1.0, 2.0, -12.5), yaw=-2.0), state())
     assert (s.position_down_m, s.yaw_rad) == (-12.5, -2.0)
@@ -550,6 +673,14 @@ def test_altitude_and_yaw_pass_as_they_are() -> None:
 def test_a_free_command_within_all_limits_is_not_touched() -> None:
     f = SafetyFilter(LIMITS)
     s = applied(f, command(Ned(0.3, -0.2, 0.0)), state(velocity=Ned(1.0, 0.0, 0.0)), [peer(Ned(4.0, 0.0, 0.0))])
+    assert acceleration(s) == (0.3, -0.2)
+    assert f.counts == {}
+
+
+def test_with_the_barrier_off_peers_are_nothing_to_it() -> None:
+    f = SafetyFilter(replace(LIMITS, barrier=False))
+    near, nowhere = peer(Ned(0.3, 0.0, 0.0)), peer(Ned(nan, 0.0, 0.0))
+    s = applied(f, command(Ned(0.3, -0.2, 0.0)), state(velocity=Ned(1.0, 0.0, 0.0)), [near, nowhere])
     assert acceleration(s) == (0.3, -0.2)
     assert f.counts == {}
 
@@ -581,6 +712,91 @@ def test_a_blocked_vehicle_passes_the_one_that_blocks_it_most() -> None:
     )
     assert acceleration(both) == pytest.approx(acceleration(alone))
     assert both.acceleration_east_m_s2 > -2.0
+
+
+@pytest.mark.parametrize(
+    ("u", "most", "less"),
+    [
+        # Nearer, so that in m^2/s^2 its edge is missed by less than the other's.
+        ((-3.0, -3.0), peer(Ned(-0.8, -0.8, 0.0)), peer(Ned(-3.0, 0.5, 0.0), Ned(1.7, -0.28, 0.0), vehicle_id=3)),
+        ((-3.0, 3.0), peer(Ned(-0.8, 0.8, 0.0)), peer(Ned(0.5, 3.0, 0.0), Ned(-0.28, -1.7, 0.0), vehicle_id=3)),
+        # Nearly above.
+        ((2.0, 2.0), peer(Ned(0.2, 0.2, -2.4)), peer(Ned(3.0, -0.5, 0.0), Ned(-2.1, 0.35, 0.0), vehicle_id=3)),
+    ],
+)
+def test_the_one_that_blocks_most_is_told_by_the_acceleration_that_is_missing(
+    u: tuple[float, float], most: Neighbour, less: Neighbour
+) -> None:
+    planes = [half_plane(state(), ZERO, n) for n in (most, less)]
+    missing = [(p.b - p.g_north * u[0] - p.g_east * u[1]) / hypot(p.g_north, p.g_east) for p in planes]
+    assert missing[0] > missing[1] > 0.0
+    past_most, past_less = (
+        nearest_feasible(*sidestep(*u, p.g_north, p.g_east, -v.north, -v.east), planes)[:2]
+        for p, v in zip(planes, (most.velocity_ned_m_s, less.velocity_ned_m_s), strict=True)
+    )
+    assert dist(past_most, past_less) > 0.02
+    f = settled(replace(LIMITS, jerk_max_m_s3=1e9))
+    assert acceleration(applied(f, command(Ned(*u, 0.0)), state(), [less, most])) == pytest.approx(past_most)
+
+
+@pytest.mark.parametrize(
+    ("u", "v", "sideways"),
+    [
+        ((1.0, 0.0), (0.0, 0.0), 0.9),
+        ((0.5, 0.0), (0.0, 0.0), 0.45),  # half as much where it presses with half a m/s^2
+        ((3.0, 0.0), (0.0, 0.0), 0.9),
+        ((1.0, 2.0), (5.0, 0.0), 0.9),
+        ((1.0, 0.0), (0.0, -0.4), 1.5),
+        ((1.0, 0.0), (0.0, 0.2), 0.6),
+        ((1.0, 0.0), (0.0, 0.6), 0.0),  # it passes already
+        ((1.0, 0.0), (0.0, 0.7), 0.0),
+        ((0.0, 2.0), (0.0, 0.0), 0.0),
+        ((-1.0, 2.0), (0.0, 0.0), 0.0),  # it does not press
+    ],
+)
+@pytest.mark.parametrize(("ahead", "size"), [((1.0, 0.0), 2.0), ((0.0, 1.0), 0.3), ((0.6, -0.8), 5.0)])
+def test_a_blocked_vehicle_is_moved_along_the_obstacle_to_its_right(
+    u: tuple[float, float], v: tuple[float, float], sideways: float, ahead: tuple[float, float], size: float
+) -> None:
+    """1.5 /s of what is missing to 0.6 m/s, times what it presses (m/s^2), 1 at most; written as (ahead, right)."""
+    right = (-ahead[1], ahead[0])
+
+    def turned(x: tuple[float, float]) -> tuple[float, float]:
+        return x[0] * ahead[0] + x[1] * right[0], x[0] * ahead[1] + x[1] * right[1]
+
+    moved = sidestep(*turned(u), -size * ahead[0], -size * ahead[1], *turned(v))
+    assert moved == pytest.approx(turned((u[0], u[1] + sideways)))
+
+
+@pytest.mark.parametrize(
+    ("obstacle", "east"),
+    [
+        (peer(Ned(1.3, 0.0, 0.0)), 0.9),
+        (peer(Ned(1.3, 0.0, 0.0), Ned(0.0, 0.3, 0.0)), 1.35),
+        (peer(Ned(1.3, 0.0, 0.0), Ned(0.0, -0.3, 0.0)), 0.45),
+        (peer(Ned(1.3, 0.0, 0.0), Ned(0.0, -0.6, 0.0)), 0.0),
+        # Lost, the one end drifting: its middle moves half as fast.
+        (peer(Ned(1.3, -1.0, 0.0), Ned(0.0, 0.4, 0.0), other_end_ned_m=Ned(1.3, 1.0, 0.0)), 1.2),
+    ],
+)
+@pytest.mark.parametrize("quarters", range(4))
+def test_what_counts_for_passing_is_the_speed_along_the_obstacle(
+    obstacle: Neighbour, east: float, quarters: int
+) -> None:
+    def turned(x: Ned) -> Ned:
+        for _ in range(quarters):
+            x = Ned(-x.east, x.north, x.down)
+        return x
+
+    other = obstacle.other_end_ned_m
+    there = obstacle._replace(
+        position_ned_m=turned(obstacle.position_ned_m), velocity_ned_m_s=turned(obstacle.velocity_ned_m_s),
+        other_end_ned_m=None if other is None else turned(other),
+    )  # fmt: skip
+    f = settled(replace(LIMITS, jerk_max_m_s3=1e9))
+    s = applied(f, command(turned(Ned(3.0, 0.0, 0.0))), state(velocity=turned(Ned(1.0, 0.0, 0.0))), [there])
+    right = turned(Ned(0.0, 1.0, 0.0))
+    assert s.acceleration_north_m_s2 * right.north + s.acceleration_east_m_s2 * right.east == pytest.approx(east)
 
 
 def test_reset_forgets_what_was_flown() -> None:
