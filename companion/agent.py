@@ -431,7 +431,7 @@ class Agent:
         automatic, flight = self.config.plan.automatic, self.flight
         up = flight.forms_without or self._all_up()
         forms = automatic and newest.revision == 0 and self.phase is Phase.WAITING and up
-        flies = automatic and newest.revision == 1 and self._all_formed() and not newest.legs
+        flies = automatic and newest.revision == 1 and self._all_formed(now) and not newest.legs
         returns = flight.return_wanted or (
             newest.then == "return"
             and newest.end_ns is not None
@@ -464,8 +464,14 @@ class Agent:
             speed_m_s=self.config.return_speed_m_s,
         )  # fmt: skip
 
-    def _all_formed(self) -> bool:
-        """This vehicle has formed, and every peer that flies with it, under the newest motion; or it waited long."""
+    def _all_formed(self, now: Instant) -> bool:
+        """This vehicle has formed, and every peer that flies with it, under the newest motion; or all waited long.
+
+        Whoever cannot get into its slot, since something stands there, keeps nobody in the air for ever.
+        """
+        late = now.fleet_ns > self.programme.newest.blend_end_ns + round(self.config.peers.wait_s * 1e9)
+        if late:
+            return self.phase in (Phase.FORMING, Phase.FORMED)
         if self.phase is not Phase.FORMED:
             return False
         for i, phase in self.peers.phases().items():

@@ -288,7 +288,7 @@ class Flight:
             case Phase.ARMED:
                 self._watch_take_off(now)
             case Phase.CLIMBING:
-                self._watch_climb(now)
+                self._watch_climb(now, positioned)
             case Phase.LANDING:
                 self._watch_landing(now)
             case Phase.RELEASED if not ap.armed:
@@ -352,7 +352,7 @@ class Flight:
                 altitude = float("nan")
             ap.ask("take-off", *wire.takeoff_parameters(altitude))
 
-    def _watch_climb(self, now: Instant) -> None:
+    def _watch_climb(self, now: Instant, positioned: bool) -> None:
         ap = self.autopilot
         if not ap.armed:
             self._happened(PhaseEvent.DISARMED, now)
@@ -364,12 +364,13 @@ class Flight:
             self._taken_over(now)
             return
         height = self.config.formation.altitude_m
+        loiters = ap.custom_mode == Px4Mode.AUTO_LOITER
         low = self.config.fleet.frame == "global" and -ap.position_ned_m.down < height - HOLD_MARGIN_M
-        if ap.custom_mode == Px4Mode.AUTO_LOITER and low and not self._mode_asked_ns:
+        if positioned and loiters and low and not self._mode_asked_ns:
             self._taken_over(now)
             return
         reached = -ap.position_ned_m.down > height - ALTITUDE_TOLERANCE_M
-        if self._mode_asked_ns or reached or ap.custom_mode == Px4Mode.AUTO_LOITER:
+        if positioned and (self._mode_asked_ns or reached or loiters):
             if not self._mode_asked_ns:
                 self._mode_asked_ns = now.monotonic_ns
                 self.safety.reset()
@@ -388,7 +389,8 @@ class Flight:
             self._land_seen = True
         elif self._land_seen:
             # On disarming PX4 falls back to the mode before, which the heartbeat tells a second later.
-            if ap.custom_mode not in (Px4Mode.OFFBOARD, self._mode_before):
+            fell_back = ap.landed_state == ON_GROUND or ap.custom_mode in (Px4Mode.OFFBOARD, self._mode_before)
+            if not fell_back:
                 self._taken_over(now)
         elif ap.custom_mode not in OUR_MODES and ap.custom_mode != self._mode_before:
             self._taken_over(now)

@@ -32,6 +32,7 @@ from companion.core.values import Instant, Phase
 from companion.operate import Operator, turn_leg, velocity_leg
 from companion.wire.mavlink import Px4Mode
 from companion.wire.peer import encode_motion
+from sim.broken_law import BrokenLaw
 from sim.lockstep import Lockstep
 from sim.network import NetworkParameters
 from sim.px4.faults import Fault, FaultKind
@@ -387,3 +388,48 @@ def test_another_take_off_after_the_plan_has_landed_is_refused_with_the_reason()
         said = json.loads(answer)
         assert not said["accepted"]
         assert said["reason"] == "the plan is over: restart the companions for another flight"
+
+
+# -- in the climb, in the landing, and a slot that cannot be reached ---------------------------------------------------
+
+
+def test_a_landing_from_the_climb_ends_as_a_landing_whatever_mode_the_autopilot_falls_back_to() -> None:
+    ls = launch(fleet(1), seed=4)
+    until(ls, 10.0, lambda: ls.phases()[1] is Phase.CLIMBING)
+    ls.vehicles[1].autopilot.inject(Fault(FaultKind.LOW_BATTERY, 0.05))
+    until_landed(ls)
+    wait(ls, 3.0)
+    assert failsafes(ls) == [(1, "failsafe: battery critical: 5 %: land")]
+    assert not any("released" in note for _, _, note in ls.notes)
+    modes = truth(ls).mode[:, 0]
+    assert Px4Mode.AUTO_LAND in modes
+    assert modes[-1] == Px4Mode.AUTO_TAKEOFF
+
+
+@pytest.mark.parametrize("altitude_m", [1.5, 2.0, 2.3])
+def test_positions_frozen_at_the_climbs_end_make_nobody_believe_in_a_pilot(altitude_m: float) -> None:
+    # Its autopilot ends the take-off in LOITER where the companion, by its last position, is far below.
+    ls = launch(fleet(2), seed=4)
+    until(ls, 20.0, lambda: ls.positions()[1].down < -altitude_m)
+    assert ls.phases()[1] is Phase.CLIMBING
+    ls.vehicles[1].autopilot.inject(Fault(FaultKind.POSITION_FROZEN, duration_s=1.2))
+    until(ls, 5.0, lambda: ls.phases()[1] is not Phase.CLIMBING)
+    assert ls.phases()[1] in (Phase.WAITING, Phase.APART)
+    assert not any("OFFBOARD left" in note for _, note in failsafes(ls))
+
+
+@pytest.mark.parametrize("stopped", [(3,), (1, 2, 3)])
+def test_the_plan_begins_although_a_slot_cannot_be_reached(stopped: tuple[int, ...]) -> None:
+    def brief(tables: dict[str, Any]) -> None:
+        tables["peers"]["wait_s"] = 6.0
+
+    ls = launch(fleet(3, legs=straight(4.0), change=brief), seed=4)
+    for i in stopped:
+        agent = ls.vehicles[i].agent
+        agent.safety = BrokenLaw(agent.config.safety_limits, velocity_ned_m_s=Ned(0.0, 0.0, 0.0))
+    until(ls, 20.0, lambda: any(v.agent.programme.newest.revision == 1 for v in ls.vehicles.values()))
+    formed = ls.vehicles[1].agent.programme.newest
+    until(ls, 40.0, lambda: any(v.agent.programme.newest.legs for v in ls.vehicles.values()))
+    assert ls.now.fleet_ns > formed.blend_end_ns + 6_000_000_000
+    assert all(ls.phases()[i] is Phase.FORMING for i in stopped)
+    until_landed(ls)
