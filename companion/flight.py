@@ -55,6 +55,8 @@ OUR_MODES = frozenset({Px4Mode.AUTO_TAKEOFF, Px4Mode.AUTO_LOITER, Px4Mode.OFFBOA
 """modes in which a vehicle may be while we fly it, but for landing"""
 STREAM_BEFORE_NS = 200_000_000
 """setpoints are streamed so long before OFFBOARD is asked for"""
+STOPPED_LOW_S = FROZEN_S + 0.1
+"""a climb that ended too low by positions that may have frozen meanwhile, which shows after FROZEN_S"""
 SLOT_JUMP_M = 1.0
 """a slot that is suddenly so far from where it was is not followed there at once"""
 ENGAGED_AWAY_M = 3.0
@@ -123,6 +125,7 @@ class Flight:
     _uncertain: Persistence = field(default_factory=lambda: Persistence(UNCERTAIN_S))
     _low: Persistence = field(default_factory=lambda: Persistence(BATTERY_S))
     _critical: Persistence = field(default_factory=lambda: Persistence(BATTERY_S))
+    _stopped_low: Persistence = field(default_factory=lambda: Persistence(STOPPED_LOW_S))
     _low_told: bool = False
 
     def __post_init__(self) -> None:
@@ -366,11 +369,12 @@ class Flight:
         height = self.config.formation.altitude_m
         loiters = ap.custom_mode == Px4Mode.AUTO_LOITER
         low = self.config.fleet.frame == "global" and -ap.position_ned_m.down < height - HOLD_MARGIN_M
-        if positioned and loiters and low and not self._mode_asked_ns:
+        stopped = positioned and loiters and low and not self._mode_asked_ns
+        if self._stopped_low.holds(stopped, now.monotonic_ns):
             self._taken_over(now)
             return
         reached = -ap.position_ned_m.down > height - ALTITUDE_TOLERANCE_M
-        if positioned and (self._mode_asked_ns or reached or loiters):
+        if positioned and not stopped and (self._mode_asked_ns or reached or loiters):
             if not self._mode_asked_ns:
                 self._mode_asked_ns = now.monotonic_ns
                 self.safety.reset()
