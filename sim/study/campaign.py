@@ -35,7 +35,7 @@ EXPLAINED: dict[str, frozenset[Failsafe]] = {
     kind: OF_THE_FLEET | own
     for kind, own in {
         "gps_lost": _NO_POSITION | {_F.POSITION_JUMPS, _F.COVARIANCE},
-        "position_frozen": _NO_POSITION,
+        "position_frozen": _NO_POSITION | {_F.PILOT},
         "estimator_reset": {_F.POSITION_JUMPED},
         "noise": {_F.POSITION_JUMPED, _F.POSITION_JUMPS},
         "low_battery": {_F.BATTERY_LOW, _F.BATTERY_CRITICAL, _F.NOT_ARMED},
@@ -51,7 +51,8 @@ EXPLAINED: dict[str, frozenset[Failsafe]] = {
         "partition": set(),
     }.items()
 }
-"""fault -> the failsafes of the same vehicle that it explains, from when it comes on; who falls strikes the ground"""
+"""fault -> the failsafes of the same vehicle that it explains, from when it comes on. Who falls strikes the ground; who
+hovers where its frozen position is not believes that a pilot ended its climb."""
 FALLS = frozenset({"rc_kill", "reboot"})
 """the motors stop"""
 
