@@ -399,13 +399,16 @@ class Agent:
         return dist(motion.reference(self.id, at_ns).position_ned_m, ours)
 
     def _adopt(self, motion: Motion, now: Instant) -> None:
+        before = self.programme.newest
         if not self.programme.adopt(motion):
             return
         self._plan_payload = encode_motion(motion)
         self.peers.plan_changed()
         if self._sent is not None:
             self._sent = (self._sent[0], self._reference_of(self._sent[0]))
-        self.flight.return_wanted = self.flight.return_wanted and not motion.returns
+        if before.returns and not motion.returns and motion.revision > before.revision:
+            # Somebody wants something else after it; a motion of the same revision only won a race.
+            self.flight.return_wanted = False
         self._plan_due_ns = now.monotonic_ns if motion.issuer == self.id else None
         self._mention(now)
         self._outputs.notes.append(adoption_note(motion))
@@ -432,7 +435,7 @@ class Agent:
         up = flight.forms_without or self._all_up()
         forms = automatic and newest.revision == 0 and self.phase is Phase.WAITING and up
         flies = automatic and newest.revision == 1 and self._all_formed(now) and not newest.legs
-        returns = flight.return_wanted or (
+        returns = (flight.return_wanted and not newest.returns) or (
             newest.then == "return"
             and newest.end_ns is not None
             and self.phase in SETTLED_PHASES
@@ -447,7 +450,7 @@ class Agent:
             return
         start_ns = now.fleet_ns + PROPOSAL_DELAY_NS
         if returns:
-            self._adopt(self._return_motion(max(start_ns, newest.start_ns + 1)), now)
+            self._return(self._return_motion(max(start_ns, newest.start_ns + 1)), now)
         elif forms:
             self._adopt(self._formation_motion(self.config.formation.shape, start_ns), now)
         elif legs := self.config.plan_legs(newest.moment(start_ns).centre.position):
@@ -457,6 +460,14 @@ class Agent:
     def _all_up(self) -> bool:
         """Every peer is in the air and steered."""
         return all(phase in FILTERED_PHASES for phase in self.peers.phases().values())
+
+    def _return(self, motion: Motion, now: Instant) -> None:
+        """Propose the way back, or land here where it would lead outside the fence: the others would refuse it."""
+        reason = self._unsound(motion, now)
+        if reason is None:
+            self._adopt(motion, now)
+        else:
+            self.flight.no_way_back(reason, now)
 
     def _return_motion(self, start_ns: int) -> Motion:
         return with_return(
@@ -546,7 +557,9 @@ class Agent:
         reference = self.flight.follow(moment.slot(motion.slots[self.id]), ego, now)
         steers = self.flight.steers
         if steers or now.monotonic_ns >= self._look_ns:
-            self._neighbours = self.peers.predict(ego.position_ned_m, now, moment, self.phase in SETTLED_PHASES)
+            self._neighbours = self.peers.predict(
+                ego.position_ned_m, now, moment, self.phase in SETTLED_PHASES, self.phase is Phase.RETURNING
+            )
             self._look_ns = now.monotonic_ns + LOOK_PERIOD_NS
         neighbours = self._neighbours
         residual = ZERO

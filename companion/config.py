@@ -39,6 +39,7 @@ from companion.core.plan import (
     goto_duration_s,
     with_formation,
     with_legs,
+    with_return,
 )
 from companion.core.route import first_breach
 from companion.core.safety import DOWNWASH_RATIO, SafetyLimits, safety_radius_m
@@ -57,6 +58,8 @@ PLAN_SPEED_SHARE = 0.75
 """part of the speed limits that the plan may ask for; the rest is left to keep up with it"""
 TURN_RATE_MIN_DEG_S = 0.01
 """slower turns are refused: their arcs are straight lines to a double's precision"""
+LANDED_APART_M = 1.0
+"""vehicles that land where they are come down so far apart: a collision's distance, and the wander of both"""
 ALTITUDE_MIN_M = 1.0
 """no slot lower than this above the fleet origin"""
 SPACING_MARGIN_M = 0.2
@@ -499,6 +502,12 @@ class FleetConfig(_Table):
                 f"(vertical half-axis {DOWNWASH_RATIO * self.safety_radius_m:.2f} m, horizontal "
                 f"{self.safety_radius_m:.2f} m): choose a larger spacing or a level shape"
             )
+        level = minimum_distance([Ned(s.north, s.east, 0.0) for s in slots])
+        if level < LANDED_APART_M * (1.0 - 1e-9):
+            raise ConfigError(
+                f"$.formation.spacing_m: slots of {shape!r} must be at least {LANDED_APART_M:g} m apart on the level, "
+                f"since vehicles land where they are, got {level:.2f} m: choose a larger spacing or a level shape"
+            )
 
     @cached_property
     def pinned(self) -> dict[int, int]:
@@ -788,12 +797,24 @@ def _outside_faults(config: FleetConfig) -> Iterator[str]:
         return
     start_ns = formed.blend_end_ns
     legs = config.plan_legs(formed.moment(start_ns).centre.position)
-    breach = first_breach(with_legs(formed, at_ns=start_ns, issuer=0, legs=legs, then=config.plan.then), fence)
+    planned = with_legs(formed, at_ns=start_ns, issuer=0, legs=legs, then=config.plan.then)
+    breach = first_breach(planned, fence)
     if breach is not None:
         yield (
             f"$.plan.legs[{breach.leg}] must stay inside the fence by its margin, "
             f"got vehicle {breach.vehicle_id} {breach.outside_m:.2f} m beyond it {breach.time_s:.1f} s into the plan"
         )
+        return
+    if config.plan.then == "return" and planned.end_ns is not None:
+        back = with_return(
+            planned, config.first_motion, at_ns=planned.end_ns, issuer=0, speed_m_s=config.return_speed_m_s
+        )
+        breach = first_breach(back, fence)
+        if breach is not None:
+            yield (
+                f'$.plan.then = "return": the way back from the last leg must stay inside the fence by its margin, '
+                f"got vehicle {breach.vehicle_id} {breach.outside_m:.2f} m beyond it"
+            )
 
 
 _UNITS = {

@@ -481,6 +481,11 @@ class Flight:
         self._fail(Failsafe.BATTERY_LOW, now, percent, action)
         return action is Action.LAND
 
+    def no_way_back(self, reason: str, now: Instant) -> None:
+        """The fleet's way back to the pads cannot be flown: land where the vehicle is."""
+        self.notes.append(f"no way back to the pads: {reason}: land")
+        self._happened(PhaseEvent.LAND, now)
+
     def _watch_peers(self, now: Instant) -> bool:
         """Whether the peers' absence decides what is done."""
         peers = self.config.peers

@@ -160,7 +160,8 @@ FAILSAFES: dict[Failsafe, Row] = {
     ),
     Failsafe.BATTERY_LOW: Row(
         "3 s below `failsafe.battery_low_percent`", BATTERY_S, Action.RETURN,
-        "with `failsafe.battery_low`: return, land or continue; land where there is no formation yet", _NOT,
+        "with `failsafe.battery_low`: return, land or continue; land where there is no formation yet and where the way "
+        "back would leave the fence", _NOT,
     ),
     Failsafe.BATTERY_CRITICAL: Row("3 s below `failsafe.battery_critical_percent`", BATTERY_S, Action.LAND, "", _NOT),
     Failsafe.LOOP_LATE: Row(

@@ -14,6 +14,7 @@ from companion.core.plan import Moment, Programme, Reference
 from companion.core.values import (
     AIRBORNE_PHASES,
     FORMATION_PHASES,
+    LOW_PHASES,
     ZERO,
     Instant,
     Neighbour,
@@ -272,11 +273,14 @@ class PeerTable:
         samples.sort(key=lambda s: (-s.time_ns, s.vehicle_id))
         return tuple(samples[: self.limits.digest_size])
 
-    def predict(self, ego_ned_m: Ned, now: Instant, moment: Moment, gated: bool) -> list[Neighbour]:
+    def predict(
+        self, ego_ned_m: Ned, now: Instant, moment: Moment, gated: bool, above_ground: bool = False
+    ) -> list[Neighbour]:
         """Every known peer within range, predicted to now under the plan at that `moment`, in the order of the ids.
 
         With `gated` (only once formed), peers whose prediction is far from what the others' say drop from alignment
-        and cohesion; they still count for separation.
+        and cohesion; they still count for separation. With `above_ground` (before landing) the place above one that
+        stands on the ground or lands is taken too, up to the own altitude.
         """
         slots = self.programme.at(now.fleet_ns).slots
         own = moment.slot(slots[self.own_id]).position_ned_m
@@ -284,6 +288,9 @@ class PeerTable:
         for i, peer in self._peers.items():
             if peer.sample is not None:
                 n = self._predict(peer, peer.sample, now, moment.slot(slots[i]), own)
+                if above_ground and peer.sample.phase in LOW_PHASES:
+                    p = n.position_ned_m
+                    n = n._replace(other_end_ned_m=p._replace(down=min(p.down, ego_ned_m.down)))
                 if self._in_range(n, ego_ned_m):
                     neighbours.append(n)
         if not gated:

@@ -53,6 +53,8 @@ SETTLED_PHASES = frozenset({Phase.FORMED, Phase.MOVING, Phase.HOLDING})
 """phases of a vehicle that has taken its slot"""
 AIRBORNE_PHASES = FILTERED_PHASES | {Phase.CLIMBING, Phase.LANDING, Phase.RELEASED}
 """phases in which a vehicle that says nothing more cannot be taken to stand where it was"""
+LOW_PHASES = frozenset({Phase.IDLE, Phase.PREFLIGHT, Phase.ARMED, Phase.LANDING, Phase.LANDED})
+"""phases of a vehicle that stands on the ground, or comes down to it"""
 FLYING_PHASES = FILTERED_PHASES | {Phase.ARMED, Phase.CLIMBING, Phase.LANDING}
 """phases in which a vehicle hangs on its companion"""
 

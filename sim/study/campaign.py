@@ -1,5 +1,6 @@
 """Fault campaign: whole flights of ten real agents in lockstep, one to three faults each, drawn by the seed."""
 
+import json
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -160,7 +161,9 @@ def fly(flight: Flight, seed: int) -> Record:
     config = _fleet(flight, Random(f"campaign/{seed}/missing").choice(("land", "continue")))
     ls = Lockstep(config, seed=seed, network=NetworkParameters(delay_s=flight.delay_s, loss=flight.loss))
     ls.run_until(READY_S, lambda: not any(v.agent.unready(ls.now) for v in ls.vehicles.values()))
-    ls.command(b'{"verb":"takeoff"}')
+    answers = {i: json.loads(a) for i, a in ls.command(b'{"verb":"takeoff"}').items()}
+    if len(answers) < flight.vehicles or not all(a["accepted"] for a in answers.values()):
+        raise RuntimeError(f"seed {seed}: the take-off is refused before any fault: {answers}")
     began_s = ls.now_ns * 1e-9
     random = Random(f"campaign/{seed}/parts")
     faults = drawn_faults(flight, seed)
@@ -183,15 +186,17 @@ def fly(flight: Flight, seed: int) -> Record:
         "left_in_hold": [i for i, v in ls.vehicles.items() if _orphan(v)],
         "unexplained": [(s, i, what.value) for s, i, what in failsafes if not _explained((s, i, what), faults)],
         "failsafes": [(s, i, what.value) for s, i, what in failsafes],
+        "formed": any(note.startswith("forming -> formed") for _, _, note in ls.notes),
+        "flew_the_plan": any("-> moving" in note for _, _, note in ls.notes),
         "ended_after_s": ls.now_ns * 1e-9 - began_s,
     }
 
 
 def _stuck(ls: Lockstep) -> list[list[Any]]:
-    """Vehicles in the air that nobody but us has in hand, and companions that still wait to take off.
+    """Vehicles that are on their way still: on our setpoints, waiting to take off, or coming down by themselves.
 
-    A companion that ends in the climb leaves its vehicle in the autopilot's hold, one that ends after a takeover in the
-    pilot's hands: that is handed over, and counted.
+    A companion that ends or starts anew in the climb leaves its vehicle in the autopilot's hold, one that is taken over
+    in the pilot's: that is handed over, and counted.
     """
     stuck: list[list[Any]] = []
     for i, v in ls.vehicles.items():
@@ -202,7 +207,9 @@ def _stuck(ls: Lockstep) -> list[list[Any]]:
 
 
 def _orphan(v: Vehicle) -> bool:
-    return not v.alive and v.autopilot.truth().landed_state != ON_GROUND
+    """In the air and nobody's companion steers it: its own has ended, was started anew, or has given it away."""
+    steered = v.alive and v.agent.phase in FLYING_PHASES
+    return not steered and v.autopilot.truth().landed_state != ON_GROUND
 
 
 def _failsafes(ls: Lockstep) -> list[tuple[float, int, Failsafe]]:
@@ -290,9 +297,14 @@ def finish(config: Config, pieces: Sequence[Record], seeds: Sequence[int]) -> Ou
     })  # fmt: skip
     held = [bool(p["left_in_hold"]) for p in pieces]
     rows.append({
-        "what": "a companion that ended left its vehicle in the autopilot's hold or with its pilot (not judged)",
+        "what": "a vehicle ended in its autopilot's hold or with its pilot: taken over, mute, companion ended "
+        "or started anew (not judged)",
         "flights": proportion_text(sum(held), n), "count": sum(held),
     })  # fmt: skip
+    rows += [
+        {"what": what, "flights": proportion_text(sum(p[key] for p in pieces), n), "count": sum(p[key] for p in pieces)}
+        for key, what in (("formed", "formed"), ("flew_the_plan", "flew the plan's legs (the others landed before)"))
+    ]
     outcome = Outcome()
     outcome.tables.append(
         Table("campaign", f"{n} flights of {flight_of(config).vehicles} vehicles", (

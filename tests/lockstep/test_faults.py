@@ -433,3 +433,68 @@ def test_the_plan_begins_although_a_slot_cannot_be_reached(stopped: tuple[int, .
     assert ls.now.fleet_ns > formed.blend_end_ns + 6_000_000_000
     assert all(ls.phases()[i] is Phase.FORMING for i in stopped)
     until_landed(ls)
+
+
+# -- the way back, and what lies on the ground -------------------------------------------------------------------------
+
+
+def test_nobody_lands_on_one_that_has_landed_beside_its_pad() -> None:
+    def back(tables: dict[str, Any]) -> None:
+        tables["plan"]["then"] = "return"
+
+    ls = launch(fleet(5, altitude_m=5.0, shape="circle", legs=straight(5.0), change=back))
+    until_formed(ls)
+    place = ls.positions()[4]
+    pad = ls.config.by_id(3)
+    assert np.hypot(place.north - pad.pad_north_m, place.east - pad.pad_east_m) < 0.5, "under it is 3's pad"
+    ls.vehicles[4].autopilot.inject(Fault(FaultKind.LOW_BATTERY, 0.05))
+    until_landed(ls, 120.0)
+    assert first(ls, "landed", 4) < first(ls, "returning -> landing", 3)
+    t = truth(ls, first(ls, "forming -> formed"))
+    assert distances(t).min() >= 1.0
+
+
+def test_a_return_for_a_low_battery_outlives_a_motion_that_was_asked_for_at_the_same_time() -> None:
+    def stay(tables: dict[str, Any]) -> None:
+        tables["plan"]["then"] = "stay"
+
+    ls = launch(fleet(2, legs=straight(3.0), change=stay))
+    until_formed(ls)
+    until(ls, 20.0, lambda: ls.all_in(Phase.MOVING))
+    agent = ls.vehicles[2].agent
+    before = agent.programme.newest
+    ls.vehicles[2].autopilot.inject(Fault(FaultKind.LOW_BATTERY, 0.2))
+    until(ls, 20.0, lambda: agent.programme.newest.returns)
+    returning = agent.programme.newest
+    asked = with_legs(before, at_ns=returning.start_ns - 10**9, issuer=0, legs=(VelocityLeg(Ned(1.0, 0.0, 0.0), 0.0),))
+    assert asked.revision == returning.revision
+    command = json.dumps({"verb": "motion", "motion": json.loads(encode_motion(asked))}).encode()
+    assert all(json.loads(a)["accepted"] for a in ls.command(command).values())
+    until(ls, 10.0, lambda: agent.programme.newest.returns and agent.programme.newest.revision > returning.revision)
+    # What is asked for afterwards, and so in its knowledge, is flown.
+    newest = agent.programme.newest
+    later = with_legs(newest, at_ns=ls.now.fleet_ns + 10**9, issuer=0, legs=(VelocityLeg(Ned(0.5, 0.0, 0.0), 0.0),))
+    command = json.dumps({"verb": "motion", "motion": json.loads(encode_motion(later))}).encode()
+    assert all(json.loads(a)["accepted"] for a in ls.command(command).values())
+    wait(ls, 8.0)
+    assert agent.programme.newest.order == later.order
+
+
+def test_a_vehicle_whose_way_back_would_leave_the_fence_lands_and_the_others_stay() -> None:
+    def notch(tables: dict[str, Any]) -> None:
+        edge = [[-8, -9], [26, -9], [26, 30], [-8, 30], [-8, 14], [9, 14], [9, 9], [-8, 9]]
+        tables["fence"] = {"polygon_m": edge, "floor_m": 1.0, "ceiling_m": 30.0, "margin_m": 1.0}
+        tables["plan"].update(then="stay", legs=[
+            {"kind": "goto", "north_m": north, "east_m": east, "speed_m_s": 2.0}
+            for north, east in ((18.0, 0.0), (18.0, 22.0), (0.0, 22.0))
+        ])  # fmt: skip
+
+    ls = launch(fleet(2, altitude_m=5.0, change=notch))
+    until_formed(ls)
+    until(ls, 100.0, lambda: ls.all_in(Phase.HOLDING))
+    ls.vehicles[2].autopilot.inject(Fault(FaultKind.LOW_BATTERY, 0.2))
+    until(ls, 20.0, lambda: ls.phases()[2] is Phase.LANDING)
+    assert any("no way back to the pads: it leads outside the fence" in note for _, i, note in ls.notes if i == 2)
+    until(ls, 30.0, lambda: ls.phases()[2] is Phase.LANDED)
+    assert ls.phases()[1] is Phase.HOLDING
+    assert ls.vehicles[1].agent.rejected["plan: it leads outside the fence"] == 0

@@ -250,6 +250,33 @@ def line_of(*slots: list[float]) -> Change:
     return change
 
 
+@pytest.mark.parametrize(("level_m", "fit"), [(0.99, False), (1.0, True), (1.01, True)])
+def test_slots_above_each_other_are_far_enough_apart_to_land(level_m: float, fit: bool) -> None:
+    stacked = line_of([0.0, 0.0, 0.0], [level_m, 0.0, -5.0])
+    if fit:
+        parse(changed(stacked), "fleet.toml")
+    else:
+        assert "'custom' must be at least 1 m apart on the level, since vehicles land where they are" in refusal(
+            stacked
+        )
+
+
+def test_a_way_back_that_leaves_the_fence_is_refused() -> None:
+    def notch(tables: Tables) -> None:
+        edge = [[-8, -9], [26, -9], [26, 30], [-8, 30], [-8, 14], [9, 14], [9, 9], [-8, 9]]
+        tables["fence"] = {"polygon_m": edge, "floor_m": 1.0, "ceiling_m": 30.0, "margin_m": 1.0}
+        tables["vehicle"] = tables["vehicle"][:2]
+        tables["plan"].update(then="land", legs=[
+            {"kind": "goto", "north_m": north, "east_m": east, "speed_m_s": 2.0}
+            for north, east in ((18.0, 0.0), (18.0, 22.0), (0.0, 22.0))
+        ])  # fmt: skip
+
+    parse(changed(notch), "fleet.toml")
+    assert '$.plan.then = "return": the way back from the last leg must stay inside' in refusal(
+        notch, put("plan.then", "return")
+    )
+
+
 def drop(path: str) -> Change:
     def change(tables: Tables) -> None:
         place: Any = tables
