@@ -727,7 +727,7 @@ class Agent:
             "oldest_age_s": age,
             "messages": self.messages_sent,
             "setpoints": self.setpoints_sent,
-            "battery_percent": self.autopilot.battery_percent,
+            "battery_percent": self.autopilot.battery(now),
             "configuration": self.config.shared_hash,
             "failsafes": list(self.flight.failsafes),
             "rejected": dict(

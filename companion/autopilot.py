@@ -9,12 +9,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import inf
 
+from companion.core.failsafe import STATUS_S
 from companion.core.frames import Geodetic, LocalFrame, Ned
 from companion.core.values import ZERO, Instant
 from companion.preflight import (
     ESTIMATOR_FLAGS_NEEDED,
     ESTIMATOR_GLOBAL_FLAG,
     ESTIMATOR_RELATIVE_FLAG,
+    HEARTBEAT_LIMIT_S,
     PARAMETERS,
     POSITION_LIMIT_S,
     AutopilotFacts,
@@ -153,6 +155,12 @@ class AutopilotClient:
         self.parameters = ParameterReader()
         self.estimator_flags = 0
         self.horizontal_accuracy_m = inf
+        self.estimator_ns: int | None = None
+        """when ESTIMATOR_STATUS last came (monotonic ns)"""
+        self.health_ns: int | None = None
+        """when SYS_STATUS last came (monotonic ns)"""
+        self.foreign_ns: int | None = None
+        """when an autopilot of another system id last spoke (monotonic ns)"""
         self.origin: Geodetic | None = None
         self.frame: LocalFrame | None = None if fleet_origin is not None else LocalFrame(ZERO)
         self.boot = BootClock()
@@ -182,7 +190,11 @@ class AutopilotClient:
         """Take a datagram; True if it brought a position."""
         self._now_ns = now.monotonic_ns
         fresh = False
-        for event in self.link.decode(datagram):
+        foreign = self.link.foreign_heard
+        events = self.link.decode(datagram)
+        if self.link.foreign_heard > foreign:
+            self.foreign_ns = now.monotonic_ns
+        for event in events:
             match event:
                 case wire.LocalPosition():
                     self.heard += 1
@@ -198,9 +210,11 @@ class AutopilotClient:
                 case wire.GlobalOrigin():
                     self._origin(event.origin)
                 case wire.EstimatorHealth():
+                    self.estimator_ns = now.monotonic_ns
                     self.estimator_flags = event.flags
                     self.horizontal_accuracy_m = event.horizontal_accuracy_m
                 case wire.SystemHealth():
+                    self.health_ns = now.monotonic_ns
                     self.battery_percent = event.battery_percent
                     self.sensors_health = event.sensors_health
                 case wire.HomePosition():
@@ -387,6 +401,16 @@ class AutopilotClient:
             ESTIMATOR_GLOBAL_FLAG if self.fleet_origin is not None else ESTIMATOR_RELATIVE_FLAG
         )
 
+    def estimator(self, now: Instant) -> tuple[int, float]:
+        """ESTIMATOR_STATUS's flags and horizontal accuracy (m); none and infinite once it is old."""
+        if not _within(self.estimator_ns, STATUS_S, now):
+            return 0, inf
+        return self.estimator_flags, self.horizontal_accuracy_m
+
+    def battery(self, now: Instant) -> int:
+        """Charge (%); -1 where SYS_STATUS does not tell it, or is old."""
+        return self.battery_percent if _within(self.health_ns, STATUS_S, now) else -1
+
     def position_age_s(self, now: Instant) -> float:
         """Age of the latest position (s); infinite before the first."""
         return inf if self.position_ns is None else (now.monotonic_ns - self.position_ns) * 1e-9
@@ -417,23 +441,28 @@ class AutopilotClient:
     def facts(self, now: Instant) -> AutopilotFacts:
         """What preflight looks at."""
         heartbeat = self.heartbeat_ns
+        flags, accuracy_m = self.estimator(now)
         return AutopilotFacts(
             heartbeat_age_s=None if heartbeat is None else (now.monotonic_ns - heartbeat) * 1e-9,
-            foreign_system_id=self.link.foreign_system_id,
+            foreign_system_id=self.link.foreign_system_id if _within(self.foreign_ns, HEARTBEAT_LIMIT_S, now) else None,
             autopilot_kind=self.autopilot_kind,
             vehicle_type=self.vehicle_type,
-            estimator_flags=self.estimator_flags,
-            sensors_health=self.sensors_health,
-            horizontal_accuracy_m=self.horizontal_accuracy_m,
+            estimator_flags=flags,
+            sensors_health=self.sensors_health if _within(self.health_ns, STATUS_S, now) else 0,
+            horizontal_accuracy_m=accuracy_m,
             origin=self.origin,
             home_altitude_amsl_m=self.home_altitude_amsl_m,
             position_ned_m=None if self.frame is None or self.position_ns is None else self.position_ned_m,
             position_age_s=self.position_age_s(now),
             position_rate_hz=self.positions_heard_hz(now),
-            battery_percent=self.battery_percent,
+            battery_percent=self.battery(now),
             round_trip_s=self.round_trip_s(now),
             # The least delayed of the last messages is nearest to the truth: delay makes the autopilot seem behind.
             clock_ahead_s=max(self._clock_ahead_ns) * 1e-9 if self._clock_ahead_ns else None,
             parameters=self.parameters.values,
             missing=frozenset(self.parameters.missing),
         )
+
+
+def _within(heard_ns: int | None, limit_s: float, now: Instant) -> bool:
+    return heard_ns is not None and now.monotonic_ns - heard_ns <= round(limit_s * 1e9)

@@ -127,6 +127,7 @@ class Flight:
     _critical: Persistence = field(default_factory=lambda: Persistence(BATTERY_S))
     _stopped_low: Persistence = field(default_factory=lambda: Persistence(STOPPED_LOW_S))
     _low_told: bool = False
+    _battery_known: bool = False
 
     def __post_init__(self) -> None:
         limits = self.config.limits
@@ -285,6 +286,7 @@ class Flight:
             # In whatever phase: a landing of which nobody tells the end would last for ever.
             self._fail(Failsafe.HEARTBEAT, now)
             return
+        self._watch_battery_status(now)
         match self.phase:
             case Phase.PREFLIGHT:
                 self._watch_arming(now)
@@ -438,10 +440,10 @@ class Flight:
                 # By now the autopilot's own failsafe has the vehicle, whether or not we can hear it.
                 self._fail(Failsafe.POSITION_LOST, now)
             return False
-        flags = ap.estimator_flags & ap.flags_needed == ap.flags_needed
-        uncertain = not (flags and ap.horizontal_accuracy_m <= ACCURACY_LIMIT_M)
+        flags, accuracy_m = ap.estimator(now)
+        uncertain = not (flags & ap.flags_needed == ap.flags_needed and accuracy_m <= ACCURACY_LIMIT_M)
         if self._uncertain.holds(uncertain, now.monotonic_ns):
-            self._fail(Failsafe.COVARIANCE, now, f"{ap.horizontal_accuracy_m:.1f} m, flags {ap.estimator_flags:#x}")
+            self._fail(Failsafe.COVARIANCE, now, f"{accuracy_m:.1f} m, flags {flags:#x}")
             return False
         if self.positions.jumps != self._jumps:
             self._jump(now)
@@ -485,6 +487,15 @@ class Flight:
         """The fleet's way back to the pads cannot be flown: land where the vehicle is."""
         self.notes.append(f"no way back to the pads: {reason}: land")
         self._happened(PhaseEvent.LAND, now)
+
+    def _watch_battery_status(self, now: Instant) -> None:
+        """Note in flight that the battery is told no more; landing for it is left to the autopilot."""
+        known = self.autopilot.battery(now) >= 0
+        if self._battery_known and not known and self.phase in FLYING_PHASES:
+            what = Failsafe.BATTERY_UNKNOWN
+            self.counts[what.value] += 1
+            self.notes.append(f"{what.value}: last told {self.autopilot.battery_percent} %")
+        self._battery_known = known
 
     def _watch_peers(self, now: Instant) -> bool:
         """Whether the peers' absence decides what is done."""

@@ -62,7 +62,7 @@ class AutopilotFacts:
     heartbeat_age_s: float | None
     """None: never heard"""
     foreign_system_id: int | None = None
-    """system id of an autopilot that speaks on this link and is not ours"""
+    """system id of an autopilot that has spoken on this link of late and is not ours"""
     autopilot_kind: int = -1
     vehicle_type: int = -1
     estimator_flags: int = 0
@@ -114,7 +114,10 @@ def _link_checks(facts: AutopilotFacts, vehicle: Vehicle) -> list[Check]:
     kind, type_ = facts.autopilot_kind, facts.vehicle_type
     return [
         Check("heartbeat", tidy(age), limit, age <= HEARTBEAT_LIMIT_S, f"no heartbeat for {age:.0f} s"),
-        Check("system id", vehicle.system_id, f"= {vehicle.system_id}", True, ""),
+        Check(
+            "system id", vehicle.system_id if foreign is None else foreign, f"= {vehicle.system_id}", foreign is None,
+            f"an autopilot of system id {foreign} is on the link beside the own one", lasting=True,
+        ),
         Check(
             "autopilot", kind, f"= {wire.AUTOPILOT_PX4} (PX4)", kind == wire.AUTOPILOT_PX4,
             f"autopilot is no PX4 (MAV_AUTOPILOT {kind})", lasting=True,
@@ -265,13 +268,27 @@ def _at_least(limit: float, unit: str) -> tuple[str, Callable[[float], bool]]:
     return f">= {limit:g} {unit}", lambda value: value >= limit * (1.0 - ROUNDING)
 
 
-def parameter_rules(config: FleetConfig) -> dict[str, Rule]:
-    """Parameter -> its rule; those of a pilot's transmitter depend on `preflight.require_rc`."""
+HOLD_ON_LOSS = 5
+"""COM_OBL_RC_ACT"""
+
+
+def parameter_rules(config: FleetConfig, on_loss: float | None = None) -> dict[str, Rule]:
+    """Parameter -> its rule; those of a pilot's transmitter depend on `preflight.require_rc`.
+
+    `on_loss`: the autopilot's COM_OBL_RC_ACT, on which COM_LOW_BAT_ACT's depends: what holds must end some day.
+    """
     limits, pilot = config.limits, config.preflight.require_rc
     longest = config.preflight.offboard_loss_limit_s
+    low_battery = Rule(*_one_of(0, 2, 3), "not an action of PX4's")
+    if on_loss == HOLD_ON_LOSS:
+        low_battery = Rule(
+            *_one_of(2, 3),
+            f"with COM_OBL_RC_ACT {HOLD_ON_LOSS} it would hover without a companion until its battery is empty",
+        )
     return {
         "COM_OF_LOSS_T": Rule(
-            f"<= {longest:g} s", lambda v: v <= longest * (1.0 + ROUNDING), "the autopilot acts too late"
+            f"<= {longest:g} s and > 0", lambda v: 0.0 < v <= longest * (1.0 + ROUNDING),
+            "the autopilot acts too late, or without need",
         ),
         "COM_OBL_RC_ACT": Rule(
             *(_one_of(0, 4, 5) if pilot else _one_of(4, 5)),
@@ -288,7 +305,7 @@ def parameter_rules(config: FleetConfig) -> dict[str, Rule]:
         ),
         "NAV_DLL_ACT": Rule(*_one_of(0, 1, 2, 3), "a lost ground station must not end in a fall"),
         "GF_ACTION": Rule(*_one_of(0, 1, 2, 3, 5), "a crossed fence must not end in a fall"),
-        "COM_LOW_BAT_ACT": Rule(*_one_of(0, 2, 3), "not an action of PX4's"),
+        "COM_LOW_BAT_ACT": low_battery,
         "MPC_XY_VEL_MAX": Rule(*_at_least(limits.speed_max_m_s, "m/s"), "slower than limits.speed_max_m_s"),
         "MPC_Z_VEL_MAX_UP": Rule(*_at_least(limits.climb_max_m_s, "m/s"), "slower than limits.climb_max_m_s"),
         "MPC_Z_VEL_MAX_DN": Rule(*_at_least(limits.descent_max_m_s, "m/s"), "slower than limits.descent_max_m_s"),
@@ -297,7 +314,7 @@ def parameter_rules(config: FleetConfig) -> dict[str, Rule]:
 
 def _parameter_checks(facts: AutopilotFacts, config: FleetConfig) -> Iterator[Check]:
     waiting = []
-    for name, rule in parameter_rules(config).items():
+    for name, rule in parameter_rules(config, facts.parameters.get("COM_OBL_RC_ACT")).items():
         value = facts.parameters.get(name)
         if value is not None:
             met = rule.meets(value)

@@ -207,7 +207,7 @@ def _separation_m(config: FleetConfig) -> float:
 
 
 def _starts(config: FleetConfig, heard: Mapping[int, Account]) -> Iterator[Check]:
-    """Who stands too close, and whose way from where it stands to where it will hover crosses another's.
+    """Who stands too close, under whom, and whose way from where it stands to where it will hover crosses another's.
 
     All climb where they stand and move over their pads when they are up, which is not at one time: a way is taken as
     all its points at once.
@@ -229,6 +229,9 @@ def _starts(config: FleetConfig, heard: Mapping[int, Account]) -> Iterator[Check
         nearest_way = min(nearest_way, way)
         if way < least:
             crossing.append(f"ways of vehicle {i} and {j} from where they stand come within {way:.2f} m")
+    aloft = {i: a.position_ned_m for i, a in heard.items() if a.position_ned_m is not None and a.flying}
+    over = {(i, j): _level(a.position_ned_m, q) for i, a in known.items() if a.position_ned_m for j, q in aloft.items()}
+    under = [f"vehicle {j} flies {d:.2f} m from over vehicle {i}'s start" for (i, j), d in over.items() if d < least]
     fence = config.geofence
     if fence is not None:
         inside = {i: fence.edge_clearance_m(*a.position_ned_m[:2]) for i, a in known.items() if a.position_ned_m}
@@ -240,6 +243,10 @@ def _starts(config: FleetConfig, heard: Mapping[int, Account]) -> Iterator[Check
     yield Check(
         "start positions", tidy(nearest), f">= {least:.2f} m apart", not close,
         f"{'; '.join(close)}; must be {least:.2f} m", lasting=True,
+    )  # fmt: skip
+    yield Check(
+        "starts under who flies", tidy(min(over.values(), default=inf)), f">= {least:.2f} m apart", not under,
+        f"{'; '.join(under)}; must be {least:.2f} m",
     )  # fmt: skip
     yield Check(
         "ways from the start", tidy(nearest_way), f">= {least:.2f} m apart", not crossing,

@@ -49,6 +49,7 @@ class Failsafe(Enum):
     PEER_CLOCK = "a peer's clock off"
     BATTERY_LOW = "battery low"
     BATTERY_CRITICAL = "battery critical"
+    BATTERY_UNKNOWN = "battery unknown"
     LOOP_LATE = "control loop late"
     DISK_FULL = "disk full"
     CONFIGURATION = "configuration changed on disk"
@@ -78,6 +79,8 @@ LOST_S = 1.5
 HEARTBEAT_S = 3.0
 UNCERTAIN_S = 2.0
 """ESTIMATOR_STATUS comes once a second: two in a row"""
+STATUS_S = 5.0
+"""ESTIMATOR_STATUS or SYS_STATUS, which come once a second, older than this: what it said is unknown"""
 BATTERY_S = 3.0
 JUMPS_S = 10.0
 LATE_S = 0.2
@@ -117,8 +120,8 @@ FAILSAFES: dict[Failsafe, Row] = {
     ),
     Failsafe.POSITION_JUMPS: Row("10 s of jumps", JUMPS_S, Action.LAND, "", _NOT),
     Failsafe.COVARIANCE: Row(
-        "2 s of ESTIMATOR_STATUS with flags missing or an accuracy worse than 3 m", UNCERTAIN_S, Action.LAND,
-        "the estimate may drift towards the others", _NOT,
+        "2 s of ESTIMATOR_STATUS with flags missing, an accuracy worse than 3 m, or none for 5 s", UNCERTAIN_S,
+        Action.LAND, "the estimate may drift towards the others", _NOT,
     ),
     Failsafe.HEARTBEAT: Row("3 s", HEARTBEAT_S, Action.HAND_OVER, "released", _BY_COMMAND),
     Failsafe.PILOT: Row(
@@ -164,6 +167,10 @@ FAILSAFES: dict[Failsafe, Row] = {
         "back would leave the fence", _NOT,
     ),
     Failsafe.BATTERY_CRITICAL: Row("3 s below `failsafe.battery_critical_percent`", BATTERY_S, Action.LAND, "", _NOT),
+    Failsafe.BATTERY_UNKNOWN: Row(
+        "5 s without SYS_STATUS, or one that no longer tells it", STATUS_S, Action.CONTINUE,
+        "noted and counted; the autopilot's COM_LOW_BAT_ACT acts", "it is told again",
+    ),
     Failsafe.LOOP_LATE: Row(
         "0.2 s between two control ticks", LATE_S, Action.CONTINUE,
         "counted; from COM_OF_LOSS_T on the autopilot's failsafe acts", "the next tick",

@@ -180,7 +180,8 @@ class PeerTable:
         last = peer.sample
         if last is None or sample.time_ns <= last.time_ns:
             return
-        steered = AIRBORNE_PHASES - {Phase.RELEASED}
+        # One that stands armed may jump: PX4's estimator resets on the ground.
+        steered = AIRBORNE_PHASES - {Phase.RELEASED, Phase.ARMED}
         if last.phase not in steered or sample.phase not in steered:
             return
         lie = None
@@ -345,13 +346,14 @@ class PeerTable:
 
         One whose presence ended was seen alive until shortly before, so it stopped no earlier than PRESENCE_DELAY_S
         before that; one that fell silent may have stopped at any time since its last sample. A vehicle that hears
-        nobody holds by itself after `isolated_flight_s`, so it flew on no longer than that. One that climbed or landed
-        is somewhere in the column between there and its altitude, or the ground.
+        nobody holds by itself after `isolated_flight_s`, so it flew on no longer than that. One that was armed,
+        climbed or landed is somewhere in the column between there and its altitude, or the ground.
         """
         if sample.phase not in FORMATION_PHASES:
             last = sample.position_ned_m
             slot = self.programme.reference(sample.vehicle_id, sample.time_ns).position_ned_m
-            ends = {Phase.CLIMBING: min(slot.down, last.down), Phase.LANDING: max(0.0, last.down)}
+            top = min(slot.down, last.down)
+            ends = {Phase.ARMED: top, Phase.CLIMBING: top, Phase.LANDING: max(0.0, last.down)}
             if sample.phase in ends:
                 return Ned(last.north, last.east, ends[sample.phase]), ZERO, last
             return *held(sample, (ZERO, ZERO), _NOWHERE, now.fleet_ns, self.limits), last

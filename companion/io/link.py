@@ -5,6 +5,7 @@ own autopilot is kept until it falls silent: nobody else is listened to or answe
 """
 
 import errno
+import fcntl
 import os
 import socket
 import struct
@@ -144,6 +145,8 @@ class UdpLink:
 class SerialLink:
     """A serial line, raw, eight bits and no parity. One that is pulled out is opened anew when it is there again.
 
+    It has one owner: two that read it would each hear a part of what is said. The lock ends with the process, as
+    TIOCEXCL would not while anybody else holds the line open.
     Bytes carry no time of reception, so a frame's is when it was read; whoever is at the other end of the wire is the
     autopilot.
     """
@@ -173,15 +176,24 @@ class SerialLink:
     def _open(self) -> int:
         fd = os.open(self.device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
         try:
+            self._own(fd)
             control = termios.tcgetattr(fd)[6]
             control[termios.VMIN], control[termios.VTIME] = 1, 0
             flags = termios.CS8 | termios.CREAD | termios.CLOCAL
             termios.tcsetattr(fd, termios.TCSANOW, [0, 0, flags, 0, self._speed, self._speed, control])
             termios.tcflush(fd, termios.TCIOFLUSH)
-        except termios.error:
+        except (OSError, termios.error):
             os.close(fd)
             raise
         return fd
+
+    @staticmethod
+    def _own(fd: int) -> None:
+        """Before the line is touched: its owner is listening."""
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise OSError(errno.EBUSY, "another process has it") from error
 
     def fileno(self) -> int:
         """For select."""

@@ -227,6 +227,8 @@ class MavlinkLink:
         self.not_read = 0
         self.foreign_system_id: int | None = None
         """of the autopilot that was last heard on this link under another system id"""
+        self.foreign_heard = 0
+        """messages of such autopilots so far"""
         self._out: Any = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=COMPANION_COMPONENT_ID)
         self._in: Any = mavlink.MAVLink(None)
         self._in.robust_parsing = True
@@ -268,6 +270,7 @@ class MavlinkLink:
             self.rejected["foreign system"] += 1
             if _is_autopilot(message):
                 self.foreign_system_id = message.get_srcSystem()
+                self.foreign_heard += 1
             return None
         match message:
             case mavlink.MAVLink_local_position_ned_message():

@@ -22,7 +22,7 @@ from flights import (
 )
 from pymavlink.dialects.v20 import development as dialect
 
-from companion.core.failsafe import FAILSAFES, LATE_S, Action, Failsafe
+from companion.core.failsafe import FAILSAFES, LATE_S, STATUS_S, UNCERTAIN_S, Action, Failsafe
 from companion.core.frames import Ned
 from companion.core.values import Instant, PeerMessage, Phase
 from companion.flight import ON_GROUND
@@ -437,6 +437,20 @@ def battery_critical() -> tuple[float, float]:
     return s.noted(Failsafe.BATTERY_CRITICAL), 4.1
 
 
+def battery_unknown() -> tuple[float, float]:
+    s = scene()
+    s.tamper(1)
+    told_ns = s.ls.vehicles[1].agent.autopilot.health_ns
+    assert told_ns is not None
+    s.began_s = told_ns * 1e-9
+    s.ls.vehicles[1].autopilot.inject(Fault(FaultKind.LOW_BATTERY, 0.5))
+    wait(s.ls, 6.0)
+    assert s.count(Failsafe.BATTERY_UNKNOWN) == 1
+    assert s.ls.vehicles[1].agent.status(s.ls.now)["battery_percent"] == -1
+    must_go_on(s, Phase.WAITING)
+    return s.after(Failsafe.BATTERY_UNKNOWN.value), 5.0
+
+
 def loop_late() -> tuple[float, float]:
     s = scene()
     s.begin()
@@ -510,7 +524,8 @@ SCENARIOS: dict[Failsafe, Callable[[], tuple[float, float]]] = {
     Failsafe.ALONE_FOR_LONG: alone_for_long, Failsafe.APART_FOR_LONG: apart_for_long, Failsafe.PEER_GONE: peer_gone,
     Failsafe.PEER_SILENT: peer_silent, Failsafe.PEER_FROZEN: peer_frozen, Failsafe.PEER_LIES: peer_lies,
     Failsafe.PEER_CLOCK: peer_clock, Failsafe.BATTERY_LOW: battery_low, Failsafe.BATTERY_CRITICAL: battery_critical,
-    Failsafe.LOOP_LATE: loop_late, Failsafe.DISK_FULL: lambda: noticed_by_the_process(Failsafe.DISK_FULL),
+    Failsafe.BATTERY_UNKNOWN: battery_unknown, Failsafe.LOOP_LATE: loop_late,
+    Failsafe.DISK_FULL: lambda: noticed_by_the_process(Failsafe.DISK_FULL),
     Failsafe.CONFIGURATION: lambda: noticed_by_the_process(Failsafe.CONFIGURATION), Failsafe.KILLED: killed,
     Failsafe.STOPPED: stopped, Failsafe.OPERATOR: operator, Failsafe.NOT_FINITE: not_finite,
 }  # fmt: skip
@@ -539,6 +554,16 @@ def test_actions_are_what_the_scenarios_check() -> None:
     assert {f for f, row in FAILSAFES.items() if row.action is Action.HOLD} == {
         Failsafe.POSITION_JUMPED, Failsafe.ALONE,
     }  # fmt: skip
+
+
+def test_an_estimator_that_says_nothing_any_more_counts_as_uncertain() -> None:
+    s = scene()
+    s.tamper(230)
+    told_ns = s.ls.vehicles[1].agent.autopilot.estimator_ns
+    assert told_ns is not None
+    s.began_s = told_ns * 1e-9
+    must_end(s, Phase.LANDING, within_s=10.0)
+    assert STATUS_S + UNCERTAIN_S <= s.noted(Failsafe.COVARIANCE) <= STATUS_S + UNCERTAIN_S + 2 * TICK_S
 
 
 @pytest.mark.parametrize("when", ["disarmed", "armed on the ground"])

@@ -58,11 +58,26 @@ def test_a_low_battery_and_a_slow_link_are_named_together() -> None:
     ls.run_until(8.0)
     assert take_off(ls, 1) == "battery at 20 %, must have 30 %"
     ls.vehicles[1].autopilot.inject(Fault(FaultKind.SLOW_LINK, 600.0))
-    ls.run_until(14.0)
+    ls.run_until(11.9)
     reasons = ls.vehicles[1].agent.unready(ls.now)
     assert "battery at 20 %, must have 30 %" in reasons
     assert "autopilot does not answer TIMESYNC" in reasons
     assert any(r.startswith("no heartbeat for") for r in reasons)
+    ls.run_until(14.0)
+    reasons = ls.vehicles[1].agent.unready(ls.now)
+    assert "battery unknown, must have 30 %" in reasons, "what was told more than 5 s ago"
+    assert "estimator not ready (flags 0x0, needs 0x17)" in reasons
+
+
+def test_a_hold_without_end_after_the_companions_death_is_refused() -> None:
+    ls = Lockstep(fleet(1))
+    ls.run_until(6.0)
+    set_parameter(ls, 1, "COM_OBL_RC_ACT", 5)
+    ls.run_until(13.0)
+    assert (take_off(ls, 1) or "").startswith("COM_LOW_BAT_ACT is 0, must be 2 or 3: with COM_OBL_RC_ACT 5")
+    set_parameter(ls, 1, "COM_LOW_BAT_ACT", 3)
+    ls.run_until(20.0)
+    assert take_off(ls, 1) is None
 
 
 def test_in_flight_nothing_of_preflight_is_asked() -> None:

@@ -164,4 +164,4 @@ def test_fleet_up_refuses_what_waiting_does_not_heal(tmp_path: Path) -> None:
     assert done.returncode == 1
     assert done.stdout == ""
     for i in fleet.ids:
-        assert f"vehicle {i}: COM_OF_LOSS_T is 1, must be <= 0.5 s: the autopilot acts too late" in done.stderr
+        assert f"vehicle {i}: COM_OF_LOSS_T is 1, must be <= 0.5 s and > 0: the autopilot acts too late" in done.stderr

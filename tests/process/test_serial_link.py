@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fleet_process import SETTLED, all_in, make_fleet, operator_of, started, wait_status
+from fleet_process import SETTLED, all_in, make_fleet, operator_of, run, started, wait_status
 from pymavlink.dialects.v20 import development as dialect
 from stub_process import QUICK
 
@@ -110,6 +110,36 @@ def test_a_line_that_was_pulled_out_is_opened_again(tmp_path: Path) -> None:
         link.close()
 
 
+def test_a_line_has_one_owner_until_it_is_closed() -> None:
+    with line() as (ours, device):
+        link = SerialLink(device, BAUD)
+        os.write(ours, frame(1))
+        with pytest.raises(CompanionError, match=f"cannot open serial line {device}: another process has it"):
+            SerialLink(device, BAUD)
+        assert received(link, 1) == [frame(1)], "nothing was taken from its owner"
+        link.close()
+        SerialLink(device, BAUD).close()
+
+
+def test_a_line_that_was_pulled_out_is_free_and_owned_again_when_reopened(tmp_path: Path) -> None:
+    device = tmp_path / "tty"
+    with line() as (_, first):
+        device.symlink_to(first)
+        link = SerialLink(str(device), BAUD)
+    assert link.receive() == []
+    with line() as (ours, second):
+        device.unlink()
+        device.symlink_to(second)
+        SerialLink(second, BAUD).close()
+        deadline_s = time.monotonic() + 10.0
+        while not select.select([ours], [], [], 0)[0]:
+            assert time.monotonic() < deadline_s
+            link.send(frame())
+        with pytest.raises(CompanionError, match="another process has it"):
+            SerialLink(second, BAUD)
+        link.close()
+
+
 @pytest.mark.parametrize(("device", "baud", "why"), [("/dev/null", BAUD, "cannot open"), ("/nowhere", BAUD, "No such"),
                                                      ("/dev/null", 12345, "12345 baud is not one of")])  # fmt: skip
 def test_what_is_no_serial_line_is_refused_with_the_reason(device: str, baud: int, why: str) -> None:
@@ -155,6 +185,10 @@ def test_a_vehicle_flies_over_a_serial_line(tmp_path: Path) -> None:
                 assert operator.take_off().all_accepted
                 said = wait_status(operator, all_in([1], *SETTLED))
                 assert said[1]["rejected"].get("malformed", 0) == 0
+                arguments = ("companion", "check", "--json", "--seconds", "1", "--vehicle", "1", "--fleet")
+                busy = run(*arguments, str(fleet.file), folder=tmp_path)
+                assert f"{device}: another process has it (is a companion running?)" in busy.stdout
+                assert not wait_status(operator, lambda said: 1 in said)[1]["failsafes"]
                 assert operator.land().all_accepted
                 wait_status(operator, all_in([1], "landed"))
                 companion.popen.terminate()

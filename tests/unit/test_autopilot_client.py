@@ -1,6 +1,7 @@
 """One autopilot as its companion sees it: clock, requests, origin, readiness."""
 
 import struct
+from math import inf
 from typing import Any
 
 import pytest
@@ -387,6 +388,28 @@ def test_an_autopilot_of_another_system_id_is_named() -> None:
     one.heartbeat(1.0)
     assert one.client.facts(at(1.0)).foreign_system_id == 9
     assert one.client.facts(at(1.0)).heartbeat_age_s is None
+    assert one.client.facts(at(4.0)).foreign_system_id == 9
+    assert one.client.facts(at(4.1)).foreign_system_id is None
+
+
+def test_an_autopilot_of_another_system_id_beside_the_own_one_is_named() -> None:
+    one = px4()
+    one.heartbeat(1.0)
+    assert one.client.facts(at(1.0)).foreign_system_id is None
+    one.mav.srcSystem = 9
+    one.heartbeat(1.2)
+    assert one.client.facts(at(1.2)).foreign_system_id == 9
+
+
+def test_what_estimator_and_battery_said_is_unknown_once_it_is_old() -> None:
+    one = ready(10.0)
+    one.says(dialect.MAVLink_sys_status_message(0, 0, 1 << 16, 0, 0, 0, 55, 0, 0, 0, 0, 0, 0), 10.0)
+    fresh, old = one.client.facts(at(15.0)), one.client.facts(at(15.01))
+    assert (fresh.estimator_flags, fresh.horizontal_accuracy_m) == (ESTIMATOR_OK, 0.5)
+    assert (fresh.battery_percent, fresh.sensors_health) == (55, 1 << 16)
+    assert (old.estimator_flags, old.horizontal_accuracy_m) == (0, inf)
+    assert (old.battery_percent, old.sensors_health) == (-1, 0)
+    assert one.client.battery(at(15.01)) == -1
 
 
 # -- parameters --------------------------------------------------------------------------------------------------------

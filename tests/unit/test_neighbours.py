@@ -254,6 +254,26 @@ def test_a_climbing_peer_stays_over_its_spot_and_comes_to_rest() -> None:
     assert n.other_end_ned_m is None
 
 
+def test_a_peer_that_ends_as_it_is_armed_may_be_anywhere_up_to_its_altitude() -> None:
+    t = table()
+    t.accept(message(sample(t, 2, 0.0, Phase.ARMED, position_ned_m=Ned(5.0, 6.0, 0.0))), at(0.0))
+    assert predicted(t, 0.1)[2].other_end_ned_m is None
+    t.presence(2, False, at(0.1))
+    n = predicted(t, 5.0)[2]
+    assert n.position_ned_m == Ned(5.0, 6.0, -10.0)
+    assert n.other_end_ned_m == Ned(5.0, 6.0, 0.0)
+    assert not n.shares_avoidance
+    assert n.uncertainty_m > LIMITS.uncertainty_m
+
+
+def test_a_peer_that_jumps_while_it_stands_armed_does_not_lie() -> None:
+    t = table()
+    for k, north in enumerate((0.0, 3.0)):
+        there = sample(t, 2, 0.5 * k, Phase.ARMED, position_ned_m=Ned(north, 0.0, 0.0))
+        t.accept(message(there, k + 1), at(0.5 * k))
+    assert t.rejected == {}
+
+
 def test_a_silent_peer_that_climbed_or_landed_is_somewhere_in_its_column() -> None:
     for phase, end in ((Phase.CLIMBING, -10.0), (Phase.LANDING, 0.0)):
         t = table()

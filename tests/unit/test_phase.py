@@ -100,7 +100,7 @@ def test_the_sets_of_phases_lie_in_each_other() -> None:
     assert {P.FORMED, P.MOVING, P.HOLDING} == SETTLED_PHASES
     assert FORMATION_PHASES | {P.APART} == FILTERED_PHASES
     assert FILTERED_PHASES | {P.ARMED, P.CLIMBING, P.LANDING} == FLYING_PHASES
-    assert FILTERED_PHASES | {P.CLIMBING, P.LANDING, P.RELEASED} == AIRBORNE_PHASES
+    assert FILTERED_PHASES | {P.ARMED, P.CLIMBING, P.LANDING, P.RELEASED} == AIRBORNE_PHASES
 
 
 def test_the_diagram_in_the_docs_is_drawn_from_the_table() -> None:

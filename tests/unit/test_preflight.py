@@ -117,6 +117,11 @@ def test_an_autopilot_of_another_system_id_is_named() -> None:
     assert said[1] == "an autopilot of system id 9 is on the link, fleet.toml says 1"
 
 
+def test_an_autopilot_of_another_system_id_beside_the_own_one_is_named() -> None:
+    said = faults(replace(FIT, foreign_system_id=9))
+    assert said == ["an autopilot of system id 9 is on the link beside the own one"]
+
+
 def test_what_is_not_known_is_told_by_name() -> None:
     assert faults(replace(FIT, origin=None, position_ned_m=None)) == ["estimator origin unknown"]
     assert faults(replace(FIT, battery_percent=-1)) == ["battery unknown, must have 30 %"]
@@ -146,8 +151,8 @@ def test_a_local_frame_needs_neither_origin_nor_global_position() -> None:
 
 
 PARAMETER_LIMITS: list[tuple[str, list[float], list[float]]] = [
-    ("COM_OF_LOSS_T", [0.5, 1.0], [1.001, 5.0]),
-    ("COM_OBL_RC_ACT", [4, 5], [-1, 0, 1, 2, 3, 6, 7]),
+    ("COM_OF_LOSS_T", [0.01, 0.5, 1.0], [-1.0, 0.0, 1.001, 5.0]),
+    ("COM_OBL_RC_ACT", [4], [-1, 0, 1, 2, 3, 6, 7]),
     ("COM_RC_OVERRIDE", [2, 3], [0, 1]),
     ("NAV_RCL_ACT", [0, 1, 2, 3], [-1, 4, 5, 6]),
     ("COM_RCL_EXCEPT", [4, 5, 6, 7], [0, 1, 2, 3]),
@@ -171,6 +176,19 @@ def test_a_parameter_is_judged_at_its_limits(name: str, allowed: list[float], re
     for value in refused:
         (said,) = faults(replace(FIT, parameters={**FIT_PARAMETERS, name: value}))
         assert said.startswith(f"{name} is {value:g}, must ")
+
+
+@pytest.mark.parametrize("require_rc", [False, True])
+@pytest.mark.parametrize(("on_loss", "low_battery", "fit"), [(4, 0, True), (5, 0, False), (5, 2, True), (5, 3, True)])
+def test_what_holds_without_a_companion_must_end_with_the_battery(
+    on_loss: int, low_battery: int, fit: bool, require_rc: bool
+) -> None:
+    there = replace(FIT, sensors_health=1 << 16, parameters={
+        **FIT_PARAMETERS, "NAV_RCL_ACT": 2, "COM_OBL_RC_ACT": on_loss, "COM_LOW_BAT_ACT": low_battery,
+    })  # fmt: skip
+    said = faults(there, config(require_rc=require_rc))
+    expected = "COM_LOW_BAT_ACT is 0, must be 2 or 3: with COM_OBL_RC_ACT 5 it would hover without a companion until "
+    assert said == ([] if fit else [expected + "its battery is empty"])
 
 
 def test_with_a_pilot_position_mode_is_fit_and_lost_rc_must_be_acted_on() -> None:

@@ -185,8 +185,26 @@ def test_estimators_origins_must_not_be_far_apart(north_m: float, fit: bool) -> 
     )  # fmt: skip
 
 
-def test_who_flies_is_not_compared_with_who_stands() -> None:
-    assert report({2: account(2, flying=True, position_ned_m=(0.0, 0.0, -10.0))}).faults == []
+def test_who_flies_elsewhere_is_not_compared_with_who_stands() -> None:
+    assert report({2: account(2, flying=True, position_ned_m=(20.0, 0.0, -10.0))}).faults == []
+
+
+@pytest.mark.parametrize(("gap_m", "fit"), [(0.001, True), (-0.01, False), (-1.0, False)])
+def test_nobody_starts_under_one_that_flies(gap_m: float, fit: bool) -> None:
+    pad, level_m = CONFIG.by_id(1), CONFIG.safety_radius_m + gap_m
+    above = account(2, flying=True, revision=3, position_ned_m=(pad.pad_north_m - level_m, pad.pad_east_m, -6.0))
+    told = report({2: above})
+    limit = f"{CONFIG.safety_radius_m:.2f} m"
+    expected = [f"vehicle 2 flies {level_m:.2f} m from over vehicle 1's start; must be {limit}"]
+    assert told.faults == ([] if fit else expected)
+    assert not told.lasting, "it may fly on"
+
+
+def test_whoever_flies_is_no_start_under_another() -> None:
+    pad = CONFIG.by_id(1)
+    both = {i: account(i, flying=True, revision=3, position_ned_m=(pad.pad_north_m, pad.pad_east_m, -3.0 * i))
+            for i in (1, 2)}  # fmt: skip
+    assert report({**both, 3: shifted(3, north=-20.0)}).faults == []
 
 
 def test_an_unknown_position_is_no_fault_of_the_fleet() -> None:
