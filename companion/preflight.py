@@ -254,7 +254,7 @@ class Rule(NamedTuple):
 
 PARAMETERS = (
     "COM_OF_LOSS_T", "COM_OBL_RC_ACT", "COM_RC_OVERRIDE", "NAV_RCL_ACT", "COM_RCL_EXCEPT", "NAV_DLL_ACT", "GF_ACTION",
-    "COM_LOW_BAT_ACT", "MPC_XY_VEL_MAX", "MPC_Z_VEL_MAX_UP", "MPC_Z_VEL_MAX_DN",
+    "COM_LOW_BAT_ACT", "COM_DISARM_LAND", "MPC_XY_VEL_MAX", "MPC_Z_VEL_MAX_UP", "MPC_Z_VEL_MAX_DN",
 )  # fmt: skip
 """PX4 parameters that preflight reads"""
 
@@ -306,6 +306,7 @@ def parameter_rules(config: FleetConfig, on_loss: float | None = None) -> dict[s
         "NAV_DLL_ACT": Rule(*_one_of(0, 1, 2, 3), "a lost ground station must not end in a fall"),
         "GF_ACTION": Rule(*_one_of(0, 1, 2, 3, 5), "a crossed fence must not end in a fall"),
         "COM_LOW_BAT_ACT": low_battery,
+        "COM_DISARM_LAND": Rule("> 0 s", lambda v: v > 0.0, "without disarming a landing has no end"),
         "MPC_XY_VEL_MAX": Rule(*_at_least(limits.speed_max_m_s, "m/s"), "slower than limits.speed_max_m_s"),
         "MPC_Z_VEL_MAX_UP": Rule(*_at_least(limits.climb_max_m_s, "m/s"), "slower than limits.climb_max_m_s"),
         "MPC_Z_VEL_MAX_DN": Rule(*_at_least(limits.descent_max_m_s, "m/s"), "slower than limits.descent_max_m_s"),

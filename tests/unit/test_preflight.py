@@ -25,7 +25,7 @@ PAD = Ned(2.0, -8.0, 0.0)
 FIT_PARAMETERS: dict[str, float | int] = {
     "COM_OF_LOSS_T": 1.0, "COM_OBL_RC_ACT": 4, "COM_RC_OVERRIDE": 3, "NAV_RCL_ACT": 0, "COM_RCL_EXCEPT": 4,
     "NAV_DLL_ACT": 0, "GF_ACTION": 2, "COM_LOW_BAT_ACT": 0, "MPC_XY_VEL_MAX": 12.0, "MPC_Z_VEL_MAX_UP": 3.0,
-    "MPC_Z_VEL_MAX_DN": 1.5,
+    "MPC_Z_VEL_MAX_DN": 1.5, "COM_DISARM_LAND": 2.0,
 }  # fmt: skip
 
 
@@ -159,6 +159,7 @@ PARAMETER_LIMITS: list[tuple[str, list[float], list[float]]] = [
     ("NAV_DLL_ACT", [0, 1, 2, 3], [-1, 4, 5, 6]),
     ("GF_ACTION", [0, 1, 2, 3, 5], [-1, 4, 6]),
     ("COM_LOW_BAT_ACT", [0, 2, 3], [-1, 1, 4]),
+    ("COM_DISARM_LAND", [0.001, 2.0], [-1.0, 0.0]),
     ("MPC_XY_VEL_MAX", [4.0, 4.001, 12.0], [3.999]),
     ("MPC_Z_VEL_MAX_UP", [1.5, 1.501], [1.499]),
     ("MPC_Z_VEL_MAX_DN", [1.0, 1.001], [0.999]),
@@ -210,7 +211,7 @@ def test_limits_that_float32_cannot_hold_are_met_by_their_nearest() -> None:
 def test_parameters_that_are_still_read_and_those_that_never_come_are_told_apart() -> None:
     some = {name: v for name, v in FIT_PARAMETERS.items() if name not in ("GF_ACTION", "NAV_DLL_ACT")}
     told = faults(replace(FIT, parameters=some, missing=frozenset({"GF_ACTION"})))
-    assert told == ["GF_ACTION cannot be read", "1 of 11 parameters not read yet"]
+    assert told == ["GF_ACTION cannot be read", "1 of 12 parameters not read yet"]
 
 
 def test_of_an_autopilot_that_is_no_px4_no_parameter_is_wanted() -> None:
