@@ -235,8 +235,10 @@ class Agent:
             self.rejected["command: not in order"] += 1
             return self._reply(refusal)
         refusal = self._obey(order, now)
+        if refusal is None:
+            self.orders.obeyed(order)
         answer = self._reply(refusal)
-        self.orders.answered(order, payload, answer, refusal is None)
+        self.orders.answered(payload, answer)
         return answer
 
     def _obey(self, order: Order, now: Instant) -> str | None:
@@ -267,6 +269,7 @@ class Agent:
             "reason": refusal,
             "phase": self.phase.name.lower(),
             "revision": self.programme.newest.revision,
+            "command": [self.orders.revision, self.orders.issuer],
         }
         return json.dumps(answer).encode()
 
@@ -281,8 +284,7 @@ class Agent:
         reasons = self.unready(now)
         if reasons:
             return "; ".join(reasons)
-        self.flight.take_off(now)
-        return None
+        return self.flight.take_off(now)
 
     def notice(self, failsafe: Failsafe, now: Instant) -> None:
         """Something that only the process around can see: it is noted and counted, and changes nothing."""

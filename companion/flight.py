@@ -63,8 +63,11 @@ ENGAGED_AWAY_M = 3.0
 """whoever engages so far from its slot comes to it by a way of its own"""
 RESUME_LIMIT_NS = 5_000_000_000
 RELEASE_LIMIT_NS = 4_000_000_000
+LATE_OFFBOARD_NS = 1_000_000_000
+"""OFFBOARD that was asked for and is wanted no longer may come so late"""
 KILL_LIMIT_NS = 10_000_000_000
 ON_GROUND = 1
+BEING_KILLED = "it is being killed"
 
 
 @dataclass(slots=True)
@@ -73,9 +76,14 @@ class _Orders:
 
     resume_ns: int | None = None
     release_ns: int | None = None
-    released_from: int = 0
-    """custom_mode at the release; whoever changes it afterwards has the vehicle"""
+    modes_to_leave: frozenset[int] = frozenset()
+    """for hold mode, since the release or the end of a resume; whoever chooses another mode has the vehicle"""
     kill_ns: int | None = None
+
+    @property
+    def none_open(self) -> bool:
+        """Whether nothing more is asked of the autopilot for a command."""
+        return self.resume_ns is None and self.release_ns is None and self.kill_ns is None
 
 
 @dataclass(slots=True)
@@ -138,7 +146,8 @@ class Flight:
     @property
     def stopped(self) -> bool:
         """Whether nothing hangs in the air on this process."""
-        return self.phase not in FLYING_PHASES or (self.phase is Phase.LANDING and self._land_seen)
+        landing = self.phase is Phase.LANDING and self._land_seen
+        return self._orders.none_open and (self.phase not in FLYING_PHASES or landing)
 
     @property
     def steers(self) -> bool:
@@ -157,31 +166,31 @@ class Flight:
 
     # -- the operator's commands: each returns why it is refused, or None ----------------------------------------------
 
-    def take_off(self, now: Instant) -> None:
+    def take_off(self, now: Instant) -> str | None:
         """Arm and climb."""
+        if self._orders.kill_ns is not None:
+            return BEING_KILLED
         self._happened(PhaseEvent.TAKE_OFF, now)
+        return None
 
     def land(self, now: Instant) -> str | None:
         """Land where the vehicle is."""
-        if self.phase is Phase.RELEASED:
-            return "the pilot has the vehicle"
-        if self.phase is Phase.IDLE and self.autopilot.armed and self._in_the_air:
-            return "it flies without this companion: resume first, or take it over"
-        self.autopilot.withdraw("arming", "take-off")
-        self._orders.resume_ns = None
+        self._end_resume(now)
         self._happened(PhaseEvent.LAND, now)
+        flies = self.autopilot.armed and self._in_the_air
+        if self.phase is Phase.IDLE and flies:
+            return "it flies without this companion: resume first, or take it over"
+        if self.phase is Phase.RELEASED or (self.phase is not Phase.LANDING and flies):
+            return "the pilot has the vehicle"
         return None
 
     def release(self, now: Instant) -> str | None:
         """Give the vehicle to the pilot: no setpoint any more, the autopilot in its hold mode."""
-        self._orders.resume_ns = None
-        if self.phase is Phase.RELEASED:
-            return None
-        if self.phase not in FLYING_PHASES:
-            self._happened(PhaseEvent.GIVEN_AWAY, now)
-            return None
+        self._end_resume(now)
+        ours = self.phase in FLYING_PHASES
         self._happened(PhaseEvent.GIVEN_AWAY, now)
-        self._orders.release_ns, self._orders.released_from = now.monotonic_ns, self.autopilot.custom_mode
+        if ours:
+            self._hold_mode_after({self.autopilot.custom_mode, Px4Mode.OFFBOARD}, now)
         return None
 
     def kill(self, now: Instant) -> str | None:
@@ -196,18 +205,33 @@ class Flight:
 
     def resume(self, now: Instant) -> str | None:
         """Steer again a vehicle that was released, or that this companion found in the air."""
-        if self.phase in FLYING_PHASES or self._orders.resume_ns is not None:
+        if self._orders.resume_ns is not None:
             return None
+        if self._orders.kill_ns is not None:
+            return BEING_KILLED
         if not self.autopilot.armed:
             return "it is not armed"
+        if next_phase(self.phase, PhaseEvent.RESUMED) is self.phase:
+            return f"it is {self.phase.name.lower()}: to resume is for the released, and for those found in the air"
         if not self._in_the_air:
             return "it is on the ground"
         if self.autopilot.state(now) is None or self.positions.frozen:
             return "no position"
-        self._orders.release_ns = self._orders.kill_ns = None
+        self._orders.release_ns = None
         self._orders.resume_ns = now.monotonic_ns
         self.safety.reset()
         return None
+
+    def _end_resume(self, now: Instant) -> None:
+        """Nothing is to be resumed any more; OFFBOARD that comes all the same is left for hold mode."""
+        if self._orders.resume_ns is not None:
+            self._orders.resume_ns = None
+            self.autopilot.withdraw(Px4Mode.OFFBOARD.name)
+            self._hold_mode_after({Px4Mode.OFFBOARD}, now)
+
+    def _hold_mode_after(self, modes: set[int], now: Instant) -> None:
+        self._orders.release_ns = now.monotonic_ns
+        self._orders.modes_to_leave = frozenset(modes - {Px4Mode.AUTO_LOITER})
 
     @property
     def _in_the_air(self) -> bool:
@@ -304,22 +328,30 @@ class Flight:
     def _watch_orders(self, now: Instant) -> None:
         ap, orders = self.autopilot, self._orders
         if orders.kill_ns is not None:
-            if not ap.armed or now.monotonic_ns - orders.kill_ns > KILL_LIMIT_NS:
+            # What was believed before the kill may be a heartbeat old.
+            stopped = not ap.armed and ap.heartbeat_ns is not None and ap.heartbeat_ns > orders.kill_ns
+            if stopped or now.monotonic_ns - orders.kill_ns > KILL_LIMIT_NS:
+                # A retry would stop the motors of a later flight.
+                ap.withdraw("kill")
                 orders.kill_ns = None
+                if ap.armed:
+                    self.notes.append("kill given up: the autopilot has not disarmed")
             else:
                 ap.ask("kill", *wire.kill_parameters())
         if orders.release_ns is not None:
-            waits = now.monotonic_ns - orders.release_ns <= RELEASE_LIMIT_NS
-            if ap.custom_mode == orders.released_from != Px4Mode.AUTO_LOITER and waits:
-                ap.set_mode(Px4Mode.AUTO_LOITER)
-            else:
-                ap.withdraw(Px4Mode.AUTO_LOITER.name)
+            left = ap.custom_mode not in orders.modes_to_leave
+            if now.monotonic_ns - orders.release_ns > (LATE_OFFBOARD_NS if left else RELEASE_LIMIT_NS):
                 orders.release_ns = None
+                ap.withdraw(Px4Mode.AUTO_LOITER.name)
+            elif left:
+                orders.modes_to_leave &= {Px4Mode.OFFBOARD}
+                ap.withdraw(Px4Mode.AUTO_LOITER.name)
+            else:
+                ap.set_mode(Px4Mode.AUTO_LOITER)
         if orders.resume_ns is not None:
             waited_ns = now.monotonic_ns - orders.resume_ns
             if not ap.armed or waited_ns > RESUME_LIMIT_NS:
-                orders.resume_ns = None
-                ap.withdraw(Px4Mode.OFFBOARD.name)
+                self._end_resume(now)
                 self.notes.append(f"resume given up: the autopilot stays in {mode_name(ap.custom_mode)}")
             elif ap.custom_mode == Px4Mode.OFFBOARD:
                 orders.resume_ns = None

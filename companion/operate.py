@@ -6,7 +6,7 @@ decides for itself whether it takes it.
 
 import json
 import secrets
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from math import pi, radians
 from typing import Any, Protocol
@@ -35,6 +35,9 @@ from companion.wire.peer import decode_motion, encode_motion
 COMMAND_LEAD_NS = 2_000_000_000
 """how far ahead of now a commanded motion starts, so that every vehicle has it by then"""
 ANSWER_TIMEOUT_S = 5.0
+INSISTED = frozenset({"land", "release", "kill"})
+"""verbs that no number may keep from a vehicle: commanded again above whatever it has obeyed"""
+INSISTED_TIMEOUTS_S = (1.0, 1.0, 2.0, 1.0)
 STATUS_TIMEOUT_S = 1.0
 KILL_STATUS_TIMEOUT_S = 0.6
 RETRY_S = 0.5
@@ -74,6 +77,8 @@ class Answers:
     refused: Mapping[int, str]
     """vehicle id -> its reason"""
     silent: tuple[int, ...]
+    outdated: tuple[int, ...] = ()
+    """who refused since it has a newer command or motion"""
 
     @property
     def all_accepted(self) -> bool:
@@ -103,25 +108,49 @@ class Operator:
     def status(self, timeout_s: float = STATUS_TIMEOUT_S) -> dict[int, dict[str, Any] | None]:
         """Each vehicle's own account of itself; None from the silent."""
         told = {i: _object(a) for i, a in self.link.ask(self.ids, "status", b"", timeout_s, RETRY_S).items()}
-        self._revision = max([self._revision, *(_command_revision(s) for s in told.values() if s is not None)])
+        self._revision = max([self._revision, *(_command_rank(s)[0] for s in told.values() if s is not None)])
         return told
 
     def command(self, verb: str, vehicle: int | None = None, **more: object) -> Answers:
-        """A verb to every vehicle or to one, asked again until each has answered or the time is over."""
+        """A verb to every vehicle or to one, asked again until each has answered or the time is over.
+
+        Those in INSISTED are commanded again, as a newer command, to whoever has obeyed a newer one meanwhile, and to
+        the silent, for whom nobody else waits.
+        """
         ids = self.ids if vehicle is None else (self.config.by_id(vehicle).id,)
+        if verb not in INSISTED:
+            return self._ask(ids, verb, ANSWER_TIMEOUT_S, more)
+        accepted: list[int] = []
+        refused: dict[int, str] = {}
+        for timeout_s in INSISTED_TIMEOUTS_S:
+            last = self._ask(ids, verb, timeout_s, more)
+            accepted += last.accepted
+            refused |= last.refused
+            ids = (*last.outdated, *last.silent)
+            if not ids:
+                break
+        refused = {i: reason for i, reason in refused.items() if i not in (*accepted, *last.silent)}
+        return Answers(tuple(sorted(accepted)), refused, last.silent, last.outdated)
+
+    def _ask(self, ids: Iterable[int], verb: str, timeout_s: float, more: Mapping[str, object]) -> Answers:
+        """The next command, the same bytes to each."""
         self._revision += 1
         order = {"verb": verb, "revision": self._revision, "issuer": self.issuer, **more}
         payload = json.dumps(order).encode()
-        accepted, refused, silent = [], {}, []
-        for i, answer in self.link.ask(ids, "command", payload, ANSWER_TIMEOUT_S, RETRY_S).items():
+        accepted, refused, silent, outdated = [], {}, [], []
+        for i, answer in self.link.ask(ids, "command", payload, timeout_s, RETRY_S).items():
             said = _object(answer)
             if said is None:
                 silent.append(i)
-            elif said.get("accepted") is True:
+                continue
+            self._revision = max(self._revision, _command_rank(said)[0])
+            if said.get("accepted") is True:
                 accepted.append(i)
-            else:
-                refused[i] = str(said.get("reason"))
-        return Answers(tuple(accepted), refused, tuple(silent))
+                continue
+            refused[i] = str(said.get("reason"))
+            if _outdated(order, said):
+                outdated.append(i)
+        return Answers(tuple(accepted), refused, tuple(silent), tuple(outdated))
 
     def take_off(self) -> Answers:
         """Every vehicle arms and climbs; PreflightError if the fleet is not fit, and then nobody is asked to."""
@@ -209,9 +238,13 @@ class Operator:
         leg = GotoLeg(target, goto_duration_s(way, speed_m_s))
         return self._send(with_legs(newest, at_ns=start_ns, issuer=0, legs=(leg,)))
 
-    def hold(self, now_ns: int) -> Answers:
-        """Stop where the formation is."""
-        return self.move(VelocityLeg(ZERO, 0.0), now_ns)
+    def hold(self, clock_ns: Callable[[], int]) -> Answers:
+        """Stop where the formation is; once more from what is newest then, if a vehicle has a newer motion or command.
+
+        A motion that one vehicle refuses for a newer one is soon replaced by that in all others too.
+        """
+        answers = self.move(VelocityLeg(ZERO, 0.0), clock_ns())
+        return self.move(VelocityLeg(ZERO, 0.0), clock_ns()) if answers.outdated else answers
 
     def _formed(self) -> Motion:
         newest = self._newest()
@@ -265,10 +298,20 @@ def _object(answer: bytes | None) -> dict[str, Any] | None:
     return said if isinstance(said, dict) else None
 
 
-def _command_revision(status: Mapping[str, Any]) -> int:
-    """Revision of the last command that a vehicle obeyed, as it tells; 0 from whoever tells none."""
-    told = status.get("command")
-    return told[0] if isinstance(told, list) and told and type(told[0]) is int else 0
+def _command_rank(said: Mapping[str, Any]) -> tuple[int, str]:
+    """Revision and issuer of the last command that a vehicle obeyed, as it tells; (0, "") from whoever tells none."""
+    match said.get("command"):
+        case [int(revision), str(issuer)] if not isinstance(revision, bool):
+            return revision, issuer
+    return 0, ""
+
+
+def _outdated(order: Mapping[str, Any], said: Mapping[str, Any]) -> bool:
+    """Whether a vehicle that refused has obeyed a newer command, or holds a newer motion, than this one."""
+    if _command_rank(said) >= (order["revision"], order["issuer"]):
+        return True
+    held = said.get("revision")
+    return order["verb"] == "motion" and isinstance(held, int) and held >= order["motion"]["revision"]
 
 
 def velocity_leg(north_m_s: float, east_m_s: float, up_m_s: float) -> VelocityLeg:

@@ -2,7 +2,8 @@
 
 A command is a JSON object with a verb, a revision and an issuer. (revision, issuer) orders them: one that is not newer
 than the last that was obeyed is refused, so that no late one overrides what came after it. The operator takes the
-newest revision that any vehicle tells, plus one.
+newest revision that any vehicle tells, plus one. Every answer tells the last command that was obeyed: an operator whose
+command came out of order can command again above it.
 """
 
 import json
@@ -71,8 +72,10 @@ class OrderBook:
             return f"command {order.revision} is more than {REVISION_JUMP_MAX} ahead of the last, {self.revision}"
         return None
 
-    def answered(self, order: Order, payload: bytes, answer: bytes, obeyed: bool) -> None:
-        """Remember a command's answer, and its place in the order if it was obeyed."""
+    def obeyed(self, order: Order) -> None:
+        """Remember a command's place in the order."""
+        self.revision, self.issuer = order.rank
+
+    def answered(self, payload: bytes, answer: bytes) -> None:
+        """Remember a command's answer."""
         self._payload, self._answer = payload, answer
-        if obeyed:
-            self.revision, self.issuer = order.rank

@@ -407,7 +407,7 @@ def kill(
 @app.command()
 def hold(fleet: FleetFile = DEFAULT_FILE, vehicles: Vehicles = None) -> None:
     """Stop the formation where it is."""
-    _operate(fleet, vehicles, "hold", lambda o: o.hold(time.time_ns()))
+    _operate(fleet, vehicles, "hold", lambda o: o.hold(time.time_ns))
 
 
 @app.command()

@@ -301,7 +301,7 @@ class Operated:
         assert self.operator.form("line", self.ls.now.fleet_ns).all_accepted
         wait(self.ls, 14.0)
         self.act("hold")
-        assert self.operator.hold(self.ls.now.fleet_ns).all_accepted
+        assert self.operator.hold(lambda: self.ls.now.fleet_ns).all_accepted
         wait(self.ls, 8.0)
         self.act("land")
         self.status = self.operator.status()

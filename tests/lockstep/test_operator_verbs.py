@@ -1,6 +1,7 @@
 """The operator's verbs beyond motions: who obeys, in which order, and what the vehicle then does."""
 
 import json
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -60,6 +61,15 @@ def mode(ls: Lockstep, i: int) -> int:
     return ls.vehicles[i].autopilot.truth().custom_mode
 
 
+def until_mode(ls: Lockstep, wanted: Px4Mode) -> None:
+    """Let time pass until vehicle 1 is just in a mode, which its companion has not heard yet."""
+    for _ in range(100):
+        if mode(ls, 1) == wanted:
+            return
+        wait(ls, 0.01)
+    raise AssertionError(mode(ls, 1))
+
+
 # -- order -----------------------------------------------------------------------------------------------------------
 
 
@@ -85,6 +95,64 @@ def test_a_refused_command_takes_no_place_in_the_order() -> None:
     ls, _ = aloft(1)
     assert not said(ls, order("kill", 9))["accepted"], "without its confirmation"
     assert said(ls, order("land", 2))["accepted"]
+
+
+class Unheard(InLockstep):
+    """A link on which some vehicles' status is lost, or what all told at one time comes again."""
+
+    def __init__(self, ls: Lockstep, *lost: int) -> None:
+        super().__init__(ls)
+        self.lost = lost
+        self.stale: dict[int, bytes | None] | None = None
+        self.sent: list[bytes] = []
+
+    def ask(
+        self, vehicle_ids: Iterable[int], kind: str, payload: bytes, timeout_s: float, retry_s: float
+    ) -> dict[int, bytes | None]:
+        if kind == "command":
+            self.sent.append(payload)
+        answers = super().ask(vehicle_ids, kind, payload, timeout_s, retry_s)
+        if kind == "status" and self.stale is not None:
+            answers, self.stale = self.stale, None
+        return {i: None if kind == "status" and i in self.lost else a for i, a in answers.items()}
+
+
+@pytest.mark.parametrize("verb", ["kill", "land", "release"])
+def test_what_ends_a_flight_gets_through_to_a_vehicle_whose_status_was_lost(verb: str) -> None:
+    ls = Lockstep(fleet(2))
+    ls.run_until(2.0)
+    assert said(ls, order("release", 7, "zoe"))["accepted"]
+    link = Unheard(ls, 1)
+    answers = getattr(Operator(ls.config, link, "me"), verb)()
+    assert answers.all_accepted
+    assert answers.accepted == (1, 2)
+    assert ls.vehicles[1].agent.status(ls.now)["command"] == [8, "me"]
+    late = said(ls, link.sent[0])
+    assert not late["accepted"], "a duplicate that comes late is still an old command"
+    assert late["command"] == [8, "me"]
+
+
+def test_of_two_operators_at_the_same_moment_the_one_who_ends_the_flight_gets_through() -> None:
+    ls = Lockstep(fleet(1))
+    ls.run_until(2.0)
+    a, b = (Operator(ls.config, InLockstep(ls), issuer) for issuer in ("operator-b", "operator-a"))
+    a.status()
+    b.status()
+    assert a.command("land").all_accepted
+    assert b.command("kill", confirm=True).all_accepted
+
+
+def test_a_hold_that_builds_on_an_old_motion_is_built_once_more_on_the_newest() -> None:
+    ls, operator = aloft(2)
+    link = Unheard(ls)
+    link.stale = link.ask([1, 2], "status", b"", 1.0, 0.5)
+    assert operator.form("line", ls.now.fleet_ns).all_accepted
+    assert operator.move(velocity_leg(0.5, 0.0, 0.0), ls.now.fleet_ns).all_accepted
+    wait(ls, 1.0)
+    assert Operator(ls.config, link).hold(lambda: ls.now.fleet_ns).all_accepted
+    for v in ls.vehicles.values():
+        newest = v.agent.programme.newest
+        assert (newest.revision, newest.shape, newest.climb_at_end_m_s) == (3, "line", 0.0)
 
 
 @pytest.mark.parametrize(
@@ -221,6 +289,71 @@ def test_a_companion_that_starts_in_flight_steers_only_on_command_and_comes_back
     assert mode(ls, 1) == Px4Mode.OFFBOARD
     assert operator.land().all_accepted
     until_landed(ls)
+
+
+def test_whoever_is_steered_already_or_lands_is_not_resumed() -> None:
+    _, operator = aloft(1)
+    why = "to resume is for the released, and for those found in the air"
+    assert operator.resume().refused == {1: f"it is waiting: {why}"}
+    assert operator.land().all_accepted
+    assert operator.resume().refused == {1: f"it is landing: {why}"}
+
+
+@pytest.mark.parametrize("verb", ["release", "land"])
+def test_a_release_or_landing_during_a_resume_leaves_the_vehicle_in_hold_mode(verb: str) -> None:
+    ls, operator = aloft(1)
+    assert operator.release().all_accepted
+    for ls.command_delay_s, reached in (
+        (0.0, Px4Mode.AUTO_LOITER),  # OFFBOARD is not asked for yet
+        (0.3, Px4Mode.AUTO_LOITER),  # it is on its way
+        (0.0, Px4Mode.OFFBOARD),  # it is there, and the companion has not heard of it
+    ):
+        wait(ls, 3.0)
+        assert operator.resume().all_accepted
+        wait(ls, ls.command_delay_s)
+        until_mode(ls, reached)
+        assert ls.phases()[1] is Phase.RELEASED
+        assert getattr(operator, verb)().refused == ({} if verb == "release" else {1: "the pilot has the vehicle"})
+        setpoints = ls.vehicles[1].agent.setpoints_sent
+        wait(ls, 2.0)
+        assert ls.phases()[1] is Phase.RELEASED
+        assert mode(ls, 1) == Px4Mode.AUTO_LOITER
+        assert ls.vehicles[1].agent.setpoints_sent == setpoints
+
+
+def test_a_companion_that_is_asked_to_end_during_a_resume_first_leaves_the_vehicle_in_hold_mode() -> None:
+    ls, operator = aloft(1)
+    agent = ls.vehicles[1].agent
+    assert operator.release().all_accepted
+    wait(ls, 3.0)
+    assert operator.resume().all_accepted
+    assert not agent.stopped
+    until_mode(ls, Px4Mode.OFFBOARD)
+    agent.stop(ls.now)
+    assert not agent.stopped
+    until(ls, 1.2, lambda: agent.stopped)
+    ls.kill(1)
+    wait(ls, 2.0)
+    assert mode(ls, 1) == Px4Mode.AUTO_LOITER
+
+
+def test_what_is_being_killed_is_not_resumed_and_a_kill_in_vain_does_not_fire_later(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    ls, operator = aloft(1)
+    assert operator.release().all_accepted
+    wait(ls, 3.0)
+    with monkeypatch.context() as lost:
+        lost.setattr(Lockstep, "_to_autopilot", lambda *_: None)
+        assert operator.kill().all_accepted
+        wait(ls, 1.0)
+        assert operator.resume().refused == {1: "it is being killed"}
+        assert not ls.vehicles[1].agent.stopped
+        wait(ls, 9.2)
+    assert operator.resume().all_accepted
+    wait(ls, 5.0)
+    assert ls.vehicles[1].autopilot.truth().armed
+    assert ls.phases()[1] in (Phase.APART, Phase.WAITING)
 
 
 def test_on_the_ground_there_is_nothing_to_resume() -> None:

@@ -8,7 +8,7 @@ from flights import failsafes, first, fleet, launch, until, until_formed, wait
 from pymavlink.dialects.v20 import development as dialect
 
 from companion.core.values import Instant, Phase
-from companion.wire.mavlink import Px4Mode, mode_parameters
+from companion.wire.mavlink import Px4Mode, arm_parameters, mode_parameters, takeoff_parameters
 from sim.lockstep import Lockstep
 from sim.px4.faults import Fault, FaultKind
 
@@ -119,6 +119,39 @@ def test_the_pilots_vehicle_takes_commands_again_only_after_it_was_disarmed() ->
     until(ls, 30.0, lambda: phase(ls) is Phase.LANDED)
     wait(ls, 2.0)
     assert json.loads(ls.command(b'{"verb":"takeoff"}')[1])["accepted"]
+
+
+def test_what_the_pilot_flies_by_hand_after_a_landing_is_neither_resumed_nor_said_to_land() -> None:
+    ls = launch(fleet(1))
+    until_formed(ls)
+    ls.command(b'{"verb":"land"}')
+    until(ls, 30.0, lambda: phase(ls) is Phase.LANDED)
+    wait(ls, 3.0)
+    switches(ls, Px4Mode.AUTO_LOITER)
+    wait(ls, 0.2)
+    orders(ls, *arm_parameters(True))
+    wait(ls, 0.5)
+    orders(ls, *takeoff_parameters(ls.config.origin.altitude_amsl_m + 3.0))
+    wait(ls, 8.0)
+    setpoints = ls.vehicles[1].agent.setpoints_sent
+    resumed, landed = (json.loads(ls.command(json.dumps({"verb": v}).encode())[1]) for v in ("resume", "land"))
+    assert resumed["reason"] == "it is landed: to resume is for the released, and for those found in the air"
+    assert (landed["accepted"], landed["reason"]) == (False, "the pilot has the vehicle")
+    wait(ls, 2.0)
+    assert (phase(ls), mode(ls)) == (Phase.LANDED, Px4Mode.AUTO_LOITER)
+    assert ls.vehicles[1].agent.setpoints_sent == setpoints
+
+
+def test_the_pilot_keeps_his_mode_when_a_resume_is_called_off_before_it_began() -> None:
+    ls = launch(fleet(1))
+    until_formed(ls)
+    switches(ls, Px4Mode.POSCTL)
+    wait(ls, 1.0)
+    assert json.loads(ls.command(b'{"verb":"resume"}')[1])["accepted"]
+    wait(ls, 0.1)
+    assert json.loads(ls.command(b'{"verb":"release"}')[1])["accepted"]
+    wait(ls, 2.0)
+    assert (phase(ls), mode(ls)) == (Phase.RELEASED, Px4Mode.POSCTL)
 
 
 def test_a_vehicle_that_somebody_else_has_armed_is_not_taken_off() -> None:

@@ -66,7 +66,8 @@ class Fleet:
                 answers[i] = json.dumps(told).encode()
             else:
                 reason = self.refusals.get(i)
-                answers[i] = json.dumps({"vehicle": i, "accepted": reason is None, "reason": reason}).encode()
+                told = {"vehicle": i, "accepted": reason is None, "reason": reason, "command": self.obeyed.get(i)}
+                answers[i] = json.dumps(told).encode()
         return answers
 
     def ask_timed(
@@ -173,14 +174,14 @@ def test_a_new_formation_follows_the_newest_motion_that_anyone_holds() -> None:
 def test_a_command_never_starts_before_the_motion_that_it_follows() -> None:
     ahead = with_legs(formed(), at_ns=NOW_NS + 60_000_000_000, issuer=1, legs=())
     link = fleet(ahead)
-    Operator(CONFIG, link).hold(NOW_NS)
+    Operator(CONFIG, link).hold(lambda: NOW_NS)
     assert link.motion().start_ns == ahead.start_ns + 1
 
 
 def test_hold_stops_the_centre_and_move_sends_it_on() -> None:
     moving = with_legs(formed(), at_ns=NOW_NS - 10_000_000_000, issuer=1, legs=(VelocityLeg(Ned(1.0, 0.0, 0.0), 60.0),))
     link = fleet(moving)
-    Operator(CONFIG, link).hold(NOW_NS)
+    Operator(CONFIG, link).hold(lambda: NOW_NS)
     held = link.motion()
     late = held.moment(NOW_NS + 30_000_000_000).centre
     assert late.velocity == (0.0, 0.0, 0.0)
@@ -215,7 +216,7 @@ def test_legs_of_the_command_line() -> None:
 def test_nothing_is_commanded_when_nobody_says_where_the_fleet_is() -> None:
     link = Fleet(dict.fromkeys(range(1, 5)))
     with pytest.raises(RefusedError, match="no vehicle answers"):
-        Operator(CONFIG, link).hold(NOW_NS)
+        Operator(CONFIG, link).hold(lambda: NOW_NS)
     assert link.commands() == []
 
 
@@ -231,7 +232,7 @@ def test_before_the_fleet_has_formed_by_itself_no_motion_takes_the_place_of_form
     operator = Operator(CONFIG, link)
     acts: list[Callable[[], Answers]] = [
         lambda: operator.form("line", NOW_NS),
-        lambda: operator.hold(NOW_NS),
+        lambda: operator.hold(lambda: NOW_NS),
         lambda: operator.move(velocity_leg(1.0, 0.0, 0.0), NOW_NS),
         lambda: operator.goto(1.0, 1.0, None, 1.0, NOW_NS),
     ]
@@ -256,7 +257,7 @@ def test_a_vehicle_whose_plan_cannot_be_read_is_named() -> None:
             return {i: json.dumps({"vehicle": i, "motion": {"version": 9}}).encode() for i in vehicle_ids}
 
     with pytest.raises(RefusedError, match="vehicle 1 tells a plan that cannot be read"):
-        Operator(CONFIG, Strange({})).hold(NOW_NS)
+        Operator(CONFIG, Strange({})).hold(lambda: NOW_NS)
 
 
 def test_a_climb_for_ever_is_not_sent() -> None:
@@ -274,6 +275,23 @@ def test_a_command_is_newer_than_the_last_that_any_vehicle_obeyed_and_than_ones_
     operator.land()
     orders = [json.loads(p) for p in link.commands()]
     assert [(o["revision"], o["issuer"]) for o in orders] == [(42, "me")] * 4 + [(43, "me")] * 4
+
+
+def test_only_what_ends_a_flight_is_commanded_again_above_a_newer_command() -> None:
+    link = fleet()
+    link.obeyed[3] = [41, "somebody"]
+    link.refusals[3] = "not newer"
+    link.refusals[2] = "it is on the ground"
+    link.motions[4] = None
+    operator = Operator(CONFIG, link, issuer="me")
+    assert operator.command("resume").outdated == (3,)
+    assert [json.loads(p)["revision"] for p in link.commands()] == [1] * 4
+    link.came.clear()
+    operator = Operator(CONFIG, link, issuer="me")
+    answers = operator.command("kill", confirm=True)
+    again = [(i, json.loads(p)["revision"]) for i, _, p in link.came[4:]]
+    assert again == [(3, 42), (4, 42), (4, 43), (4, 44)], "whoever has a newer one, and the silent"
+    assert answers == Answers((1,), {2: "it is on the ground", 3: "not newer"}, (4,))
 
 
 def test_two_operators_are_two_issuers() -> None:
