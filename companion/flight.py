@@ -205,10 +205,10 @@ class Flight:
 
     def resume(self, now: Instant) -> str | None:
         """Steer again a vehicle that was released, or that this companion found in the air."""
-        if self._orders.resume_ns is not None:
-            return None
         if self._orders.kill_ns is not None:
             return BEING_KILLED
+        if self.phase in FILTERED_PHASES or self._orders.resume_ns is not None:
+            return None
         if not self.autopilot.armed:
             return "it is not armed"
         if next_phase(self.phase, PhaseEvent.RESUMED) is self.phase:

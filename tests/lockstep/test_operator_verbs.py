@@ -291,10 +291,12 @@ def test_a_companion_that_starts_in_flight_steers_only_on_command_and_comes_back
     until_landed(ls)
 
 
-def test_whoever_is_steered_already_or_lands_is_not_resumed() -> None:
-    _, operator = aloft(1)
+def test_a_resume_changes_nothing_for_whoever_is_steered_already_and_is_refused_in_the_landing() -> None:
+    ls, operator = aloft(1)
     why = "to resume is for the released, and for those found in the air"
-    assert operator.resume().refused == {1: f"it is waiting: {why}"}
+    assert operator.resume().all_accepted
+    wait(ls, 0.5)
+    assert ls.phases()[1] is Phase.WAITING
     assert operator.land().all_accepted
     assert operator.resume().refused == {1: f"it is landing: {why}"}
 
