@@ -19,10 +19,10 @@ def test_twenty_flights_with_random_faults_break_no_rule(tmp_path: Path) -> None
     quiet = Console(file=StringIO())
     setup = tmp_path / "four.toml"
     text = Path(campaign.__file__).with_suffix(".toml").read_text(encoding="utf-8")
-    text = text.replace("vehicles = 10 ", "vehicles = 4 ").replace("fence_radius_m = 22.0", "fence_radius_m = 17.0")
+    text = text.replace("vehicles = 10 ", "vehicles = 4 ").replace("fence_radius_m = 22.0", "fence_radius_m = 18.0")
     setup.write_text(text, encoding="utf-8")
     assert flight_of(load_config("campaign", setup)).vehicles == 4
-    assert flight_of(load_config("campaign", setup)).fence_radius_m == 17.0
+    assert flight_of(load_config("campaign", setup)).fence_radius_m == 18.0
     study("campaign", "0..19", tmp_path, setup=setup, jobs=len(os.sched_getaffinity(0)), console=quiet)
     found = json.loads((tmp_path / "campaign.json").read_text(encoding="utf-8"))
     assert found["broken"] == []
