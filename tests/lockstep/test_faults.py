@@ -80,7 +80,6 @@ class Killed:
 
 FLIGHTS = {
     "v": ("v", 3.0, 20.0, 4.0, False),
-    "column": ("column", 6.0, 24.0, 4.0, False),
     "column of 3 m": ("column", 6.0, 30.0, 3.0, False),
     "column of 3 m, stopped": ("column", 6.0, 30.0, 3.0, True),
 }
