@@ -17,13 +17,13 @@ from companion.flight import ON_GROUND
 from companion.wire.mavlink import Px4Mode
 from sim.lockstep import UTC_AT_START_NS, Lockstep
 from sim.px4.faults import Fault, FaultKind
+from sim.study.campaign import ESTIMATE_FAULTS
 
 pytestmark = pytest.mark.timeout(600)
 """flights are simulated within a test, on whatever machine"""
 
 IDS = st.sampled_from([1, 2])
-BLINDING = (FaultKind.GPS_LOST, FaultKind.POSITION_FROZEN, FaultKind.ESTIMATOR_RESET, FaultKind.NOISE)
-"""after these nobody can know where the vehicle truly is"""
+BLINDING = [kind for kind in FaultKind if kind.value in ESTIMATE_FAULTS]
 FENCE = {"radius_m": 15.0, "floor_m": 1.0, "ceiling_m": 8.0}
 ENDED_S = 120.0
 
