@@ -283,7 +283,7 @@ def study(
 
     Needs the extra: pip install 'starling-fleet[study]'.
     """
-    from sim.study.cli import study as run
+    from sim.study.run import study as run
 
     run(name, seeds, out, jobs, setup)
 

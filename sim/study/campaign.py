@@ -337,4 +337,6 @@ def finish(config: Config, pieces: Sequence[Record], seeds: Sequence[int]) -> Ou
         f"the least distance of vehicles that knew where they were is {least:.2f} m."
     )
     outcome.values |= {"rows": rows, "broken": bad, "least_m": least}
+    if bad:
+        outcome.broken = f"{len(bad)} of {n} flights broke a rule, of seeds {', '.join(str(b['seed']) for b in bad)}"
     return outcome

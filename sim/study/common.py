@@ -82,6 +82,8 @@ class Outcome:
     """sentences for the report"""
     values: Record = field(default_factory=dict)
     """what NAME.json holds besides"""
+    broken: str = ""
+    """which rule that must hold did not, and where; ends the command with status 1"""
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,29 +4,51 @@ import json
 import os
 from io import StringIO
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rich.console import Console
 
+from companion.errors import CompanionError
 from sim.study import campaign
 from sim.study.campaign import Drawn, drawn_faults, flight_of
-from sim.study.cli import study
 from sim.study.common import load_config
+from sim.study.run import study
+
+
+def _fly(folder: Path, seeds: str, changes: dict[str, str], jobs: int = 1) -> None:
+    """The campaign with some lines of its set-up changed; each must be there."""
+    text = Path(campaign.__file__).with_suffix(".toml").read_text(encoding="utf-8")
+    for line, changed in changes.items():
+        assert line in text
+        text = text.replace(line, changed)
+    setup = folder / "own.toml"
+    setup.write_text(text, encoding="utf-8")
+    study("campaign", seeds, folder, jobs, setup, Console(file=StringIO()))
+
+
+def _found(folder: Path) -> dict[str, Any]:
+    return dict(json.loads((folder / "campaign.json").read_text(encoding="utf-8")))
 
 
 @pytest.mark.timeout(1200)
 def test_twenty_flights_with_random_faults_break_no_rule(tmp_path: Path) -> None:
-    quiet = Console(file=StringIO())
-    setup = tmp_path / "four.toml"
-    text = Path(campaign.__file__).with_suffix(".toml").read_text(encoding="utf-8")
-    text = text.replace("vehicles = 10 ", "vehicles = 4 ").replace("fence_radius_m = 22.0", "fence_radius_m = 18.0")
-    setup.write_text(text, encoding="utf-8")
-    assert flight_of(load_config("campaign", setup)).vehicles == 4
-    assert flight_of(load_config("campaign", setup)).fence_radius_m == 18.0
-    study("campaign", "0..19", tmp_path, setup=setup, jobs=len(os.sched_getaffinity(0)), console=quiet)
-    found = json.loads((tmp_path / "campaign.json").read_text(encoding="utf-8"))
+    four = {"vehicles = 10 ": "vehicles = 4 ", "fence_radius_m = 22.0": "fence_radius_m = 18.0"}
+    _fly(tmp_path, "0..19", four, jobs=len(os.sched_getaffinity(0)))
+    found = _found(tmp_path)
     assert found["broken"] == []
     assert [row["count"] for row in found["rows"][:4]] == [0, 0, 0, 0]
+
+
+def test_a_broken_rule_ends_the_command_with_a_sentence_after_its_report_is_written(tmp_path: Path) -> None:
+    """Two vehicles that have no time to land: when the flight is judged they are on their way still."""
+    short = {"vehicles = 10 ": "vehicles = 2 ", "seconds = 200.0": "seconds = 4.0"}
+    with pytest.raises(CompanionError, match=r"^1 of 1 flights broke a rule, of seeds 7: .*campaign\.html$"):
+        _fly(tmp_path, "7", short)
+    broken = _found(tmp_path)["broken"]
+    assert [b["seed"] for b in broken] == [7]
+    assert len(broken[0]["stuck"]) == 2
+    assert (tmp_path / "campaign.html").exists()
 
 
 def test_a_seed_draws_the_same_one_to_three_faults_each_time_within_their_window() -> None:

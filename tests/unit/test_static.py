@@ -1,5 +1,6 @@
-"""What the tools say of the source: lint, format and types, as pyproject.toml asks."""
+"""What the tools say of the source: lint, format and types, as pyproject.toml asks; the tests that the docs name."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -16,3 +17,16 @@ ROOT = Path(__file__).resolve().parents[2]
 def test_the_source_is_clean(command: tuple[str, ...]) -> None:
     result = subprocess.run([sys.executable, "-m", *command], cwd=ROOT, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stdout + result.stderr
+
+
+def test_every_test_that_the_docs_name_exists() -> None:
+    """Names in backquotes; one that ends in dots is the beginning of one."""
+    docs = "\n".join(p.read_text(encoding="utf-8") for p in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))))
+    code = "\n".join(p.read_text(encoding="utf-8") for p in (ROOT / "tests").rglob("*.py"))
+    defined = set(re.findall(r"^ *(?:async )?(?:def )?(test_\w+)(?:\(| = )", code, re.MULTILINE))
+    named = re.findall(r"`(test_\w+)(\.\.\.)?`", docs)
+    files = re.findall(r"\btests/[\w/]+\.(?:py|toml)", docs)
+    assert len(named) > 20
+    assert len(files) > 10
+    assert [n for n, dots in named if n not in defined and not (dots and any(d.startswith(n) for d in defined))] == []
+    assert [f for f in files if not (ROOT / f).exists()] == []

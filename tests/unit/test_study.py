@@ -18,9 +18,9 @@ from companion.core.values import PeerMessage, PeerSample, Phase
 from companion.errors import ConfigError
 from companion.wire.peer import encode_state
 from sim.study import common, headon
-from sim.study.cli import study
 from sim.study.common import load_config, measured, parse_seeds, proportion_interval
 from sim.study.faults import _ablated
+from sim.study.run import study
 from sim.study.scale import step_costs
 from sim.study.theory import lyapunov, shortest_interval_s
 from sim.swarm import run

@@ -1,16 +1,12 @@
 """`fleet study NAME`: check what was asked, run it with a progress bar, write tables, figures and a report."""
 
-import sys
 from pathlib import Path
-from typing import Annotated
 
-import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from companion.errors import CompanionError, ConfigError
 from sim.study.common import (
-    FLOWN_STUDIES,
     STUDIES,
     Config,
     Outcome,
@@ -36,7 +32,11 @@ def study(
     setup: Path | None = None,
     console: Console | None = None,
 ) -> Path:
-    """Run one study, or `all`; returns the report's path. What is refused raises ConfigError with a sentence."""
+    """Run one study, or `all`; returns the report's path.
+
+    Raises ConfigError with a sentence for what is refused, CompanionError after the report is written if a rule that
+    must hold was broken.
+    """
     names = STUDIES if name == "all" else (name,)
     for each in names:
         study_module(each)
@@ -67,30 +67,8 @@ def study(
     console.print(
         f"{report}: {sum(len(o.tables) for _, o in done)} tables, {sum(len(o.figures) for _, o in done)} figures"
     )
+    for finding in (f for _, o in done for f in o.findings):
+        console.print(finding)
+    if broken := [o.broken for _, o in done if o.broken]:
+        raise CompanionError(f"{'; '.join(broken)}: {report}")
     return report
-
-
-app = typer.Typer(add_completion=False, help="The paper's results, which reading gives them, and ours beside them.")
-
-
-@app.command()
-def command(
-    name: Annotated[str, typer.Argument(help=f"one of {', '.join(STUDIES + FLOWN_STUDIES)}, or all")],
-    seeds: Annotated[
-        str | None, typer.Option(help="as in 0..19 (the default) or 0,3,5; without it, all takes 20..39")
-    ] = None,
-    out: Annotated[Path, typer.Option(help="folder for tables, figures and report")] = Path("study"),
-    jobs: Annotated[int, typer.Option(help="processes")] = 1,
-    setup: Annotated[Path | None, typer.Option(help="your own copy of the study's TOML file")] = None,
-) -> None:
-    """Run a study: NAME.json, CSV, PNG, SVG and an HTML report in --out. Finished seeds are not run again."""
-    try:
-        study(name, seeds, out, jobs, setup)
-    except CompanionError as error:
-        Console(stderr=True).print(f"[bold red]refused:[/] {error}", highlight=False, soft_wrap=True)
-        raise typer.Exit(2) from error
-
-
-def main() -> None:
-    """Entry of `python -m sim.study`."""
-    app(args=sys.argv[1:], prog_name="fleet study")
