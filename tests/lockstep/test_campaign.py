@@ -48,7 +48,9 @@ def test_a_broken_rule_ends_the_command_with_a_sentence_after_its_report_is_writ
     broken = _found(tmp_path)["broken"]
     assert [b["seed"] for b in broken] == [7]
     assert len(broken[0]["stuck"]) == 2
-    assert (tmp_path / "campaign.html").exists()
+    page = (tmp_path / "campaign.html").read_text(encoding="utf-8")
+    assert "1 of 1 flights broke a rule" in page
+    assert "Parameters were chosen on" not in page
 
 
 def test_a_seed_draws_the_same_one_to_three_faults_each_time_within_their_window() -> None:

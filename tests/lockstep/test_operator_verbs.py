@@ -196,8 +196,8 @@ def test_a_motion_that_climbs_for_ever_or_begins_far_away_is_refused() -> None:
 # -- rtl -------------------------------------------------------------------------------------------------------------
 
 
-def test_ten_vehicles_fly_back_over_their_own_pads_and_land_there() -> None:
-    ls = launch(fleet(10, change=stay), seed=2)
+def test_six_vehicles_fly_back_over_their_own_pads_and_land_there() -> None:
+    ls = launch(fleet(6, change=stay), seed=2)
     until_formed(ls)
     operator = Operator(ls.config, InLockstep(ls))
     assert operator.form("circle", ls.now.fleet_ns).all_accepted
