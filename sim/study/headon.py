@@ -217,5 +217,5 @@ def _figure(meeting: Meeting, rows: Sequence[Record]) -> Figure:
         ax.axhline(COLLISION_M, color=RED, ls="--", lw=1)
         ax.set(xlabel="delay (ms)", title=f"lag {lag:g} s", ylim=(0, None))
     axes[0, 0].set_ylabel("least distance of all seeds (m)")
-    axes[0, 0].legend(loc="lower left", fontsize=7)
+    axes[0, -1].legend(loc="upper right", fontsize=7)
     return Figure("headon", "Least distance of two vehicles sent at each other; 0.5 m is a collision.", fig)
