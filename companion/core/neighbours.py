@@ -13,6 +13,7 @@ from companion.core.hold import HoldKind, axis, weights
 from companion.core.plan import Moment, Programme, Reference
 from companion.core.values import (
     AIRBORNE_PHASES,
+    FLYING_PHASES,
     FORMATION_PHASES,
     LOW_PHASES,
     ZERO,
@@ -181,7 +182,7 @@ class PeerTable:
         if last is None or sample.time_ns <= last.time_ns:
             return
         # One that stands armed may jump: PX4's estimator resets on the ground.
-        steered = AIRBORNE_PHASES - {Phase.RELEASED, Phase.ARMED}
+        steered = FLYING_PHASES - {Phase.ARMED}
         if last.phase not in steered or sample.phase not in steered:
             return
         lie = None

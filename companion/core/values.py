@@ -51,13 +51,13 @@ FILTERED_PHASES = FORMATION_PHASES | {Phase.APART}
 """phases in which a vehicle's own safety filter steers it"""
 SETTLED_PHASES = frozenset({Phase.FORMED, Phase.MOVING, Phase.HOLDING})
 """phases of a vehicle that has taken its slot"""
-AIRBORNE_PHASES = FILTERED_PHASES | {Phase.ARMED, Phase.CLIMBING, Phase.LANDING, Phase.RELEASED}
-"""phases in which a vehicle that says nothing more cannot be taken to stand where it was: an armed one may have been
-told to take off"""
 LOW_PHASES = frozenset({Phase.IDLE, Phase.PREFLIGHT, Phase.ARMED, Phase.LANDING, Phase.LANDED})
 """phases of a vehicle that stands on the ground, or comes down to it"""
 FLYING_PHASES = FILTERED_PHASES | {Phase.ARMED, Phase.CLIMBING, Phase.LANDING}
 """phases in which a vehicle hangs on its companion"""
+AIRBORNE_PHASES = FLYING_PHASES | {Phase.RELEASED}
+"""phases in which a vehicle that says nothing more cannot be taken to stand where it was: an armed one may have been
+told to take off"""
 
 
 class VehicleState(NamedTuple):

@@ -22,6 +22,7 @@ from flights import (
 )
 from pymavlink.dialects.v20 import development as dialect
 
+from companion.autopilot import AutopilotClient
 from companion.core.failsafe import FAILSAFES, LATE_S, STATUS_S, UNCERTAIN_S, Action, Failsafe
 from companion.core.frames import Ned
 from companion.core.values import Instant, PeerMessage, Phase
@@ -79,6 +80,13 @@ class Scene:
         self.begin()
         v = self.ls.vehicles[1]
         v.autopilot = Tampered(v.autopilot, dropped, commands)  # type: ignore[assignment]
+
+    def silence(self, message: int, last: Callable[[AutopilotClient], int | None]) -> None:
+        """Nothing more of one message; the fault begins as the last of it came."""
+        self.tamper(message)
+        said_ns = last(self.ls.vehicles[1].agent.autopilot)
+        assert said_ns is not None
+        self.began_s = said_ns * 1e-9
 
     @property
     def phase(self) -> Phase:
@@ -235,10 +243,7 @@ def covariance() -> tuple[float, float]:
 
 def heartbeat() -> tuple[float, float]:
     s = scene()
-    s.tamper(0)
-    said_ns = s.ls.vehicles[1].agent.autopilot.heartbeat_ns
-    assert said_ns is not None
-    s.began_s = said_ns * 1e-9
+    s.silence(0, lambda autopilot: autopilot.heartbeat_ns)
     must_end(s, Phase.RELEASED, within_s=5.0)
     return s.noted(Failsafe.HEARTBEAT), 3.0
 
@@ -439,10 +444,7 @@ def battery_critical() -> tuple[float, float]:
 
 def battery_unknown() -> tuple[float, float]:
     s = scene()
-    s.tamper(1)
-    told_ns = s.ls.vehicles[1].agent.autopilot.health_ns
-    assert told_ns is not None
-    s.began_s = told_ns * 1e-9
+    s.silence(1, lambda autopilot: autopilot.health_ns)
     s.ls.vehicles[1].autopilot.inject(Fault(FaultKind.LOW_BATTERY, 0.5))
     wait(s.ls, 6.0)
     assert s.count(Failsafe.BATTERY_UNKNOWN) == 1
@@ -558,10 +560,7 @@ def test_actions_are_what_the_scenarios_check() -> None:
 
 def test_an_estimator_that_says_nothing_any_more_counts_as_uncertain() -> None:
     s = scene()
-    s.tamper(230)
-    told_ns = s.ls.vehicles[1].agent.autopilot.estimator_ns
-    assert told_ns is not None
-    s.began_s = told_ns * 1e-9
+    s.silence(230, lambda autopilot: autopilot.estimator_ns)
     must_end(s, Phase.LANDING, within_s=10.0)
     assert STATUS_S + UNCERTAIN_S <= s.noted(Failsafe.COVARIANCE) <= STATUS_S + UNCERTAIN_S + 2 * TICK_S
 
