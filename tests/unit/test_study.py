@@ -15,7 +15,7 @@ pytest.importorskip("matplotlib")
 
 from companion.core.frames import Ned
 from companion.core.values import PeerMessage, PeerSample, Phase
-from companion.errors import ConfigError
+from companion.errors import CompanionError, ConfigError
 from companion.wire.peer import encode_state
 from sim.study import common, headon
 from sim.study.common import load_config, measured, parse_seeds, proportion_interval
@@ -230,6 +230,19 @@ def test_the_head_on_study_writes_its_table_and_the_edge_of_the_safe_region(tmp_
     assert [r["close_count"] for r in found["compared"]] == [0, 1]
     for name in ("headon_table.csv", "headon_edge.csv", "headon.png", "headon.svg", "headon.html"):
         assert (tmp_path / name).stat().st_size > 0
+
+
+def test_a_head_on_meeting_below_the_bar_ends_the_command_with_a_sentence(tmp_path: Path) -> None:
+    """Half of the messages lost: of seed 29 all that matter."""
+    setup = tmp_path / "lossy.toml"
+    text = Path(headon.__file__).with_suffix(".toml").read_text(encoding="utf-8")
+    for key, values in (("lags_s", "[0.3]"), ("delays_s", "[0.1]"), ("losses", "[0.0]"), ("loss", "0.5")):
+        text = re.sub(rf"^{key} = .*", f"{key} = {values}", text, flags=re.MULTILINE)
+    setup.write_text(text, encoding="utf-8")
+    with pytest.raises(
+        CompanionError, match=r"^with the filter two came to 0\.\d\d m, must be 0\.85 m: .*headon\.html$"
+    ):
+        study("headon", "29", tmp_path, setup=setup, console=_quiet())
 
 
 @pytest.mark.parametrize(("missing", "more"), [("gust_m_s2", ""), ("", "speed")])
