@@ -5,7 +5,6 @@ go in, bytes come out. It never reads a clock and never raises for what others s
 """
 
 import json
-from collections import Counter
 from dataclasses import dataclass, field
 from math import dist
 from random import Random
@@ -13,6 +12,7 @@ from typing import Any
 
 from companion.autopilot import AutopilotClient
 from companion.config import FleetConfig
+from companion.core.counts import Counts, Refusal, RefusalKind
 from companion.core.estimate import BiasObserver, SendFilter
 from companion.core.failsafe import LATE_S, Failsafe
 from companion.core.frames import Ned, geodetic_to_ned
@@ -51,10 +51,10 @@ from companion.core.values import (
 )
 from companion.errors import ConfigError, WireError
 from companion.flight import Flight
-from companion.orders import REVISION_JUMP_MAX, Order, OrderBook, read_order
+from companion.orders import ORDER_FAULTS, REVISION_JUMP_MAX, Order, OrderBook, read_order
 from companion.preflight import Account, Check, assignment_hash, own_checks, unmet
 from companion.wire.mavlink import MavlinkLink, mode_name
-from companion.wire.peer import decode_motion, decode_state, encode_motion, encode_state
+from companion.wire.peer import WIRE_FAULTS, decode_motion, decode_state, encode_motion, encode_state
 
 TIMER_SLACK = 2.5
 """without a new position the control tick comes this many periods after the last"""
@@ -73,6 +73,15 @@ SPREAD_NS = 50_000_000
 """times the vehicles, up to CATCH_UP_NS: over this time they spread what all have reason to say at once"""
 PLAN_COPIES = 2
 """a plan that this many others have just told need not be told again"""
+REJECTED = (
+    "peer: unknown topic",
+    "state: id is not the key's",
+    *(f"{topic}: {kind}" for topic in ("state", "plan") for kind in WIRE_FAULTS),
+    *(f"plan: {kind}" for kind in RefusalKind),
+    *(f"command: {kind}" for kind in (*ORDER_FAULTS, "motion")),
+    *(failsafe.value for failsafe in Failsafe),
+)
+"""what an agent counts"""
 LOOK_PERIOD_NS = 200_000_000
 """who does not steer looks at its peers this often: a crowd on the ground need not work as in the air"""
 
@@ -120,7 +129,7 @@ class Agent:
         self.vehicle = config.by_id(vehicle_id)
         self.id = vehicle_id
         self.boot_id = boot_id
-        self.rejected: Counter[str] = Counter()
+        self.rejected = Counts(REJECTED)
         self.link = MavlinkLink(self.vehicle.system_id)
         origin = config.origin if config.fleet.frame == "global" else None
         self.autopilot = AutopilotClient(self.link, origin, config.limits.control_rate_hz)
@@ -201,7 +210,7 @@ class Agent:
                 return
             message = decode_state(payload)
         except WireError as error:
-            self.rejected[f"{topic}: {str(error).split(':')[0]}"] += 1
+            self.rejected[f"{topic}: {error.kind}"] += 1
             return
         if key.split("/")[-2:-1] != [str(message.sample.vehicle_id)]:
             self.rejected["state: id is not the key's"] += 1
@@ -226,18 +235,15 @@ class Agent:
         if again is not None:
             return again
         order = read_order(payload)
-        if isinstance(order, tuple):
-            kind, sentence = order
-            self.rejected[f"command: {kind}"] += 1
-            return self._reply(sentence)
+        if isinstance(order, Refusal):
+            return self._refuse(order)
         refusal = self.orders.refusal(order)
         if refusal is not None:
-            self.rejected["command: not in order"] += 1
-            return self._reply(refusal)
-        refusal = self._obey(order, now)
-        if refusal is None:
+            return self._refuse(refusal)
+        reason = self._obey(order, now)
+        if reason is None:
             self.orders.obeyed(order)
-        answer = self._reply(refusal)
+        answer = self._reply(reason)
         self.orders.answered(payload, answer)
         return answer
 
@@ -261,6 +267,10 @@ class Agent:
             self.rejected["command: motion"] += 1
             return str(error)
         return self._consider(motion, now)
+
+    def _refuse(self, refusal: Refusal) -> bytes:
+        self.rejected[f"command: {refusal.kind}"] += 1
+        return self._reply(refusal.sentence)
 
     def _reply(self, refusal: str | None) -> bytes:
         answer = {
@@ -358,38 +368,46 @@ class Agent:
             return None if known else f"revision {motion.revision} is not newer than {self.programme.newest.revision}"
         refusal = self._unsound(motion, now)
         if refusal is not None:
-            self.rejected[f"plan: {refusal.split(',')[0]}"] += 1
-            return refusal
+            self.rejected[f"plan: {refusal.kind}"] += 1
+            return refusal.sentence
         self._adopt(motion, now)
         return None
 
-    def _unsound(self, motion: Motion, now: Instant) -> str | None:
+    def _unsound(self, motion: Motion, now: Instant) -> Refusal | None:
         if motion.revision > self.programme.newest.revision + REVISION_JUMP_MAX:
-            return f"its revision {motion.revision} is more than {REVISION_JUMP_MAX} ahead"
+            return Refusal(
+                RefusalKind.REVISION, f"its revision {motion.revision} is more than {REVISION_JUMP_MAX} ahead"
+            )
         if set(motion.slots) != set(self.programme.newest.slots):
-            return "its vehicles are not this fleet's"
+            return Refusal(RefusalKind.VEHICLES, "its vehicles are not this fleet's")
         if abs(motion.start_ns - now.fleet_ns) > 3_600_000_000_000:
-            return "it starts more than an hour from now; are the clocks set?"
+            return Refusal(RefusalKind.START, "it starts more than an hour from now; are the clocks set?")
         fastest = top_speed_m_s(motion)
         if not fastest <= self.config.limits.speed_max_m_s:
-            return f"its centre flies at more than {self.config.limits.speed_max_m_s:g} m/s, at {fastest:.1f} m/s"
+            most = self.config.limits.speed_max_m_s
+            return Refusal(RefusalKind.SPEED, f"its centre flies at more than {most:g} m/s, at {fastest:.1f} m/s")
         breach = first_breach(motion, self.config.geofence)
         if breach is not None and not only_stops(motion, self.programme.newest):
-            return f"it leads outside the fence, {breach.sentence()}"
+            return Refusal(RefusalKind.FENCE, f"it leads outside the fence, {breach.sentence()}")
         if motion.then == "stay" and abs(motion.climb_at_end_m_s) > LEVEL_M_S:
-            return "it climbs or sinks for ever; give an altitude to go to"
+            return Refusal(RefusalKind.CLIMB, "it climbs or sinks for ever; give an altitude to go to")
         away_m = self._away_m(motion, now)
         if not away_m <= self.config.peers.range_m:
-            return f"it begins out of range, {away_m:.0f} m from where this vehicle is to be"
+            return Refusal(
+                RefusalKind.RANGE, f"it begins out of range, {away_m:.0f} m from where this vehicle is to be"
+            )
         if motion.shape == PADS:
-            same = over_the_pads(motion, self.config.first_motion)
-            return None if same else "its pads are not this vehicle's; do the configurations differ?"
+            if over_the_pads(motion, self.config.first_motion):
+                return None
+            return Refusal(RefusalKind.SLOTS, "its pads are not this vehicle's; do the configurations differ?")
         try:
             slots = self.config.slots(motion.shape)
         except ConfigError as error:
-            return str(error)
+            return Refusal(RefusalKind.SHAPE, str(error))
         if not assignment_matches(motion, slots, self.config.pinned):
-            return "its slots are not what this vehicle assigns; do the configurations differ?"
+            return Refusal(
+                RefusalKind.SLOTS, "its slots are not what this vehicle assigns; do the configurations differ?"
+            )
         return None
 
     def _away_m(self, motion: Motion, now: Instant) -> float:
@@ -465,11 +483,11 @@ class Agent:
 
     def _return(self, motion: Motion, now: Instant) -> None:
         """Propose the way back, or land here where it would lead outside the fence: the others would refuse it."""
-        reason = self._unsound(motion, now)
-        if reason is None:
+        refusal = self._unsound(motion, now)
+        if refusal is None:
             self._adopt(motion, now)
         else:
-            self.flight.no_way_back(reason, now)
+            self.flight.no_way_back(refusal.sentence, now)
 
     def _return_motion(self, start_ns: int) -> Motion:
         return with_return(

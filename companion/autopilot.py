@@ -4,11 +4,12 @@ PX4's quirks that shape it: an answer to a command names only the command, so co
 another; GPS_GLOBAL_ORIGIN comes once after boot and must be requested; LOCAL_POSITION_NED says nothing of its validity.
 """
 
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import inf
 
+from companion.core.counts import Counts
 from companion.core.failsafe import STATUS_S
 from companion.core.frames import Geodetic, LocalFrame, Ned
 from companion.core.values import ZERO, Instant
@@ -40,6 +41,14 @@ LATENCY_WINDOW_NS = 1_000_000_000
 """short, since a simulated autopilot's clock may run several per cent slow: what it falls behind within the window
 counts as delay"""
 ACCEPTED, TEMPORARILY_REJECTED, IN_PROGRESS = 0, 1, 5
+
+
+COUNTED = (
+    "autopilot reboot", "position repeated", "estimator origin moved", "time answer to nothing asked",
+    "answer to nothing asked", "unanswered",
+    *(f"refused: {name}" for name in ("stream", "arming", "take-off", "kill", *(mode.name for mode in Px4Mode))),
+)  # fmt: skip
+"""what a client counts"""
 
 
 @dataclass(slots=True)
@@ -136,7 +145,7 @@ class AutopilotClient:
     ) -> None:
         self.link = link
         self.position_rate_hz = position_rate_hz
-        self.counts: Counter[str] = Counter()
+        self.counts = Counts(COUNTED)
         self.heard = 0
         """heartbeats and positions so far: what proves that it is our autopilot that speaks"""
         self.notes: list[str] = []

@@ -10,7 +10,11 @@ class ConfigError(CompanionError):
 
 
 class WireError(CompanionError):
-    """Bytes that are not what they claim to be."""
+    """Bytes that are not what they claim to be; `kind` is a short fixed name for counting, `detail` what came."""
+
+    def __init__(self, kind: str, detail: str = "") -> None:
+        super().__init__(f"{kind}: {detail}" if detail else kind)
+        self.kind = kind
 
 
 class RefusedError(CompanionError):

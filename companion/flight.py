@@ -4,12 +4,12 @@ No I/O and no peers' bytes: `agent` asks it at each control tick where to be (`f
 and passes the operator's commands on. Phases are `core.phase`'s, failsafes `core.failsafe`'s.
 """
 
-from collections import Counter
 from dataclasses import dataclass, field
 from math import dist, hypot
 
 from companion.autopilot import AutopilotClient
 from companion.config import FleetConfig
+from companion.core.counts import Counts
 from companion.core.failsafe import (
     BATTERY_S,
     CLIMB_S,
@@ -98,7 +98,7 @@ class Flight:
     safety: SafetyFilter
     phase: Phase = Phase.IDLE
     failsafes: list[str] = field(default_factory=list)
-    counts: Counter[str] = field(default_factory=Counter)
+    counts: Counts = field(default_factory=lambda: Counts(failsafe.value for failsafe in Failsafe))
     notes: list[str] = field(default_factory=list)
     """what happened, for the log; emptied by the agent"""
     return_wanted: bool = False

@@ -1,12 +1,12 @@
 """The peer table: what this vehicle knows of the others, and what that says about now."""
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import dist, hypot, isfinite
 from statistics import median
 
-from companion.core.failsafe import FROZEN_S, SUSPECT_S
+from companion.core.counts import Counts
+from companion.core.failsafe import FROZEN_S, SUSPECT_S, Failsafe
 from companion.core.frames import Ned
 from companion.core.health import MOVING_M_S, jumped
 from companion.core.hold import HoldKind, axis, weights
@@ -45,6 +45,10 @@ UNCERTAINTY_GROWTH_M_S = 0.3
 UNCERTAINTY_GROWTH_MAX_M = 1.0
 
 
+REFUSED = ("own id", "foreign id", "not finite", "from the future", "too old on arrival", "repeated or out of order")
+"""why a sample is not taken"""
+LIES = (Failsafe.PEER_LIES.value, Failsafe.PEER_FROZEN.value)
+"""why nothing is built on a sample that is taken"""
 _NOWHERE = Reference(ZERO, ZERO, ZERO, 0.0)
 
 
@@ -121,7 +125,7 @@ class PeerTable:
     """every enabled vehicle's id but the own"""
     limits: PeerLimits
     programme: Programme
-    rejected: Counter[str] = field(default_factory=Counter)
+    rejected: Counts = field(default_factory=lambda: Counts((*REFUSED, *(f"digest: {r}" for r in REFUSED), *LIES)))
     _peers: dict[int, _Peer] = field(default_factory=dict)
     _gated: frozenset[int] = frozenset()
     _gated_until_ns: int = 0
@@ -191,13 +195,13 @@ class PeerTable:
             (sample.time_ns - last.time_ns) * 1e-9, PEER_ACCELERATION_M_S2, PEER_MARGIN_M, PEER_MARGIN_M_S,
             PEER_SPEED_M_S,
         ):  # fmt: skip
-            lie = "a peer's state jumps"
+            lie = Failsafe.PEER_LIES.value
         elif (
             sample.position_ned_m == last.position_ned_m
             and hypot(*sample.velocity_ned_m_s) > MOVING_M_S
             and sample.time_ns - peer.same_since_ns >= FROZEN_S * 1e9
         ):
-            lie = "a peer's position frozen"
+            lie = Failsafe.PEER_FROZEN.value
         if lie is not None:
             self.rejected[lie] += 1
             peer.suspect_until_ns = now.fleet_ns + round(SUSPECT_S * 1e9)

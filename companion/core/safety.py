@@ -19,12 +19,12 @@ The fence's walls are half-planes of the same kind (`core.fence`). Altitude is l
 sent stays between floor and ceiling, and the velocity sent ends there.
 """
 
-from collections import Counter
 from collections.abc import MutableSequence, Sequence
 from dataclasses import dataclass, field
 from math import copysign, hypot, inf, isfinite, sqrt
 from typing import NamedTuple
 
+from companion.core.counts import Counts
 from companion.core.estimate import VelocityReference
 from companion.core.fence import Fence, braking_pole_per_s, wall_plane
 from companion.core.frames import Ned
@@ -223,12 +223,20 @@ def project(
     return north, east, met
 
 
+ACTING = (
+    "not finite", "peer not finite: braking", "command not finite: braking", "speed", "jerk", "acceleration",
+    "velocity bias", "altitude", "outside the fence", "fence", "fence not attainable", "peer distance",
+    "peer distance not attainable",
+)  # fmt: skip
+"""what the filter counts"""
+
+
 @dataclass(slots=True)
 class SafetyFilter:
     """One vehicle's filter: makes every SafeSetpoint that is sent."""
 
     limits: SafetyLimits
-    counts: Counter[str] = field(default_factory=Counter)
+    counts: Counts = field(default_factory=lambda: Counts(ACTING))
     """how often which limit acted, by tick"""
     velocity_reference: VelocityReference = field(default_factory=VelocityReference)
     acceleration_m_s2: tuple[float, float] = (0.0, 0.0)

@@ -6,7 +6,6 @@ autopilot's local NED frame here; `agent` shifts them to the fleet frame.
 
 import os
 import struct
-from collections import Counter
 from dataclasses import dataclass
 from enum import IntEnum
 from math import inf, isfinite, nan
@@ -15,6 +14,7 @@ from typing import Any
 os.environ.setdefault("MAVLINK20", "1")
 from pymavlink.dialects.v20 import development as mavlink
 
+from companion.core.counts import Counts
 from companion.core.frames import Geodetic, Ned
 
 dialect = mavlink
@@ -26,6 +26,8 @@ MULTICOPTERS = frozenset({2, 3, 4, 13, 14, 15, 29})
 """MAV_TYPE: quadrotor, coaxial, helicopter, hexarotor, octorotor, tricopter, dodecarotor"""
 PLAUSIBLE_MAX = 1e6
 """no position (m) or velocity (m/s) is larger than this: float32 holds far more, and squares of it overflow later"""
+REJECTED = ("malformed", "foreign system", "not finite", "out of range")
+"""what a link counts"""
 SETPOINT_TYPE_MASK = 0x903
 """ignore x, y, az and yaw rate: velocity and acceleration on the level, altitude by position, climb rate, yaw"""
 
@@ -223,7 +225,7 @@ class MavlinkLink:
 
     def __init__(self, system_id: int) -> None:
         self.system_id = system_id
-        self.rejected: Counter[str] = Counter()
+        self.rejected = Counts(REJECTED)
         self.not_read = 0
         self.foreign_system_id: int | None = None
         """of the autopilot that was last heard on this link under another system id"""

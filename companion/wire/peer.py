@@ -22,6 +22,8 @@ from companion.errors import WireError
 
 VERSION = 2
 """2: thirteen phases instead of seven"""
+WIRE_FAULTS = ("version", "length", "phase", "not finite", "out of range", "motion")
+"""every kind of WireError that is raised here"""
 PLAUSIBLE_MAX = 1e6
 """no position (m) or velocity (m/s) is larger than this: float32 holds far more, and squares of it overflow later"""
 _HEADER = struct.Struct("<BBBBIIIqB")
@@ -152,7 +154,7 @@ def decode_motion(payload: bytes) -> Motion:
         m = _Motion.model_validate_json(payload)
     except ValidationError as error:
         first = error.errors()[0]
-        raise WireError(f"motion: {'.'.join(str(p) for p in first['loc'])}: {first['msg']}") from None
+        raise WireError("motion", f"{'.'.join(str(p) for p in first['loc'])}: {first['msg']}") from None
     legs: list[Leg] = []
     for leg in m.legs:
         match leg:
@@ -160,7 +162,7 @@ def decode_motion(payload: bytes) -> Motion:
                 legs.append(VelocityLeg(Ned(*leg.velocity_ned_m_s), leg.duration_s))
             case _TurnLeg():
                 if not abs(leg.rate_rad_s) >= TURN_RATE_MIN_RAD_S:
-                    raise WireError("motion: a turn without a rate")
+                    raise WireError("motion", "a turn without a rate")
                 legs.append(TurnLeg(leg.rate_rad_s, float("inf") if leg.angle_rad is None else leg.angle_rad))
             case _GotoLeg():
                 legs.append(GotoLeg(Ned(*leg.target_ned_m), leg.duration_s))

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import development as dialect
 
 from companion.agent import Agent
+from companion.core.counts import OTHER
 from companion.core.frames import Ned
 from companion.core.values import Instant, PeerMessage, PeerSample, Phase
 from companion.wire.peer import VERSION, encode_motion, encode_state
@@ -281,9 +282,10 @@ def test_what_is_refused_is_counted_and_changes_not_one_bit_of_what_is_sent() ->
         "malformed", "not finite", "out of range", "foreign system", "state: length", "state: version",
         "state: not finite", "state: out of range", "from the future", "state: id is not the key's", "foreign id",
         "own id", "peer: unknown topic", "plan: motion", "command: malformed", "command: motion",
-        "command: unknown verb", "command: revision", "plan: its vehicles are not this fleet's",
+        "command: unknown verb", "command: revision", "plan: not this fleet's vehicles",
     ):  # fmt: skip
         assert counted[kind] > 50, (kind, counted)
+    assert OTHER not in counted
 
 
 # -- an agent on the ground, and any order of events -------------------------------------------------------------------

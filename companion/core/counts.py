@@ -1,0 +1,79 @@
+"""Counting what goes wrong, under names from a fixed set; and refusals, whose kind is such a name.
+
+A name that holds a number from outside (a revision, an id) would make a new entry for each message, until the status
+that tells the counts is too large to be sent. So a counter knows its names from the start, and whatever else counts as
+OTHER.
+"""
+
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from enum import StrEnum, unique
+from typing import Any, Final, NamedTuple
+
+OTHER: Final = "other"
+"""what counts under no name of its own"""
+
+
+class Counts(Counter[str]):
+    """How often each of a fixed set of things has happened; `counts[name] += 1` for a name outside it counts OTHER."""
+
+    def __init__(self, names: Iterable[str]) -> None:
+        super().__init__()
+        self.names: Final = frozenset(names)
+
+    def _known(self, name: str) -> str:
+        return name if name in self.names else OTHER
+
+    def __getitem__(self, name: str) -> int:
+        return super().__getitem__(self._known(name))
+
+    def __setitem__(self, name: str, count: int) -> None:
+        super().__setitem__(self._known(name), count)
+
+    def update(  # type: ignore[override]
+        self, iterable: Iterable[str] | Mapping[str, int] | None = None, /, **more: int
+    ) -> None:
+        """Count each of these once; a mapping's as often as it says."""
+        for name, count in Counter(iterable, **more).items():
+            self[name] += count
+
+    def copy(self) -> "Counts":
+        """The same names and counts."""
+        other = Counts(self.names)
+        other.update(self)
+        return other
+
+    def __reduce__(self) -> Any:
+        return _restored, (self.names, dict(self))
+
+
+def _restored(names: frozenset[str], counted: dict[str, int]) -> Counts:
+    counts = Counts(names)
+    counts.update(counted)
+    return counts
+
+
+@unique
+class RefusalKind(StrEnum):
+    """Why a motion is refused, as a name for counting."""
+
+    NOT_NEWER = "not newer"
+    REVISION = "revision too far ahead"
+    VEHICLES = "not this fleet's vehicles"
+    START = "starts more than an hour from now"
+    SPEED = "too fast"
+    FENCE = "leads outside the fence"
+    CLIMB = "climbs or sinks for ever"
+    RANGE = "begins out of range"
+    SHAPE = "unknown shape"
+    SLOTS = "slots are not what is assigned here"
+    MALFORMED = "malformed"
+
+
+class Refusal(NamedTuple):
+    """Why something that was asked is not done."""
+
+    kind: str
+    """a short fixed name for counting: for a motion a RefusalKind"""
+    sentence: str
+    """for people: what came, what is allowed"""
