@@ -14,6 +14,7 @@ from companion.autopilot import AutopilotClient
 from companion.config import FleetConfig
 from companion.core.counts import Counts, Refusal, RefusalKind
 from companion.core.estimate import BiasObserver, SendFilter
+from companion.core.events import Event, MotionAdopted
 from companion.core.failsafe import LATE_S, Failsafe
 from companion.core.frames import Ned, geodetic_to_ned
 from companion.core.law import finish, pair, separation, total
@@ -86,11 +87,6 @@ LOOK_PERIOD_NS = 200_000_000
 """who does not steer looks at its peers this often: a crowd on the ground need not work as in the air"""
 
 
-def adoption_note(motion: Motion) -> str:
-    """What a vehicle logs when it adopts a motion; the summary knows by it which motions were flown."""
-    return f"motion {motion.revision} ({motion.shape}) by {motion.issuer or 'the operator'}"
-
-
 @dataclass(slots=True)
 class Tick:
     """What one control tick did, for the log and the live table."""
@@ -118,6 +114,8 @@ class Outputs:
     """(topic, payload)"""
     notes: list[str] = field(default_factory=list)
     """what happened, for the log"""
+    events: list[Event] = field(default_factory=list)
+    """what happened, as values"""
     tick: Tick | None = None
 
 
@@ -431,7 +429,9 @@ class Agent:
             self.flight.return_wanted = False
         self._plan_due_ns = now.monotonic_ns if motion.issuer == self.id else None
         self._mention(now)
-        self._outputs.notes.append(adoption_note(motion))
+        by = motion.issuer or "the operator"
+        self._outputs.notes.append(f"motion {motion.revision} ({motion.shape}) by {by}")
+        self._outputs.events.append(MotionAdopted(motion))
 
     def _compare_motions(self, message: PeerMessage, now: Instant) -> None:
         theirs = motion_order(message.sample.revision, message.motion_start_ns, message.motion_issuer)
@@ -544,6 +544,8 @@ class Agent:
             out.peers.append(("plan", self._plan_payload))
         out.notes = [*self.flight.notes, *out.notes, *self.autopilot.notes]
         self.flight.notes.clear()
+        out.events = [*self.flight.events, *out.events]
+        self.flight.events.clear()
         self.autopilot.notes.clear()
         self._outputs = Outputs()
         return out
@@ -734,6 +736,7 @@ class Agent:
             "vehicle": self.id,
             "phase": self.phase.name.lower(),
             "mode": mode_name(self.autopilot.custom_mode),
+            "killed": None if self.flight.killed is None else self.flight.killed.value,
             "armed": self.autopilot.armed,
             "ready": [c.says for c in unready],
             "unfit": [c.says for c in unready if c.lasting],

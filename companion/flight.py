@@ -10,6 +10,7 @@ from math import dist, hypot
 from companion.autopilot import AutopilotClient
 from companion.config import FleetConfig
 from companion.core.counts import Counts
+from companion.core.events import Event, FailsafeActed, KillCause, Killed, PhaseChanged
 from companion.core.failsafe import (
     BATTERY_S,
     CLIMB_S,
@@ -66,6 +67,10 @@ RELEASE_LIMIT_NS = 4_000_000_000
 LATE_OFFBOARD_NS = 1_000_000_000
 """OFFBOARD that was asked for and is wanted no longer may come so late"""
 KILL_LIMIT_NS = 10_000_000_000
+FALL_M_S = 4.0
+"""no autopilot sinks so fast on its own motors (PX4's limits of descent end there): who does falls"""
+FALL_NS = 10_000_000_000
+"""a fall so shortly before or after the motors were seen to stop has to do with it"""
 ON_GROUND = 1
 BEING_KILLED = "it is being killed"
 
@@ -79,6 +84,8 @@ class _Orders:
     modes_to_leave: frozenset[int] = frozenset()
     """for hold mode, since the release or the end of a resume; whoever chooses another mode has the vehicle"""
     kill_ns: int | None = None
+    kill_armed: bool = False
+    """whether there were motors to stop"""
 
     @property
     def none_open(self) -> bool:
@@ -101,6 +108,10 @@ class Flight:
     counts: Counts = field(default_factory=lambda: Counts(failsafe.value for failsafe in Failsafe))
     notes: list[str] = field(default_factory=list)
     """what happened, for the log; emptied by the agent"""
+    events: list[Event] = field(default_factory=list)
+    """what happened, as values; emptied by the agent"""
+    killed: KillCause | None = None
+    """how the motors were stopped before the vehicle had landed, since the last take-off command"""
     return_wanted: bool = False
     """a failsafe of this vehicle wants the whole fleet back over its pads"""
     forms_without: bool = False
@@ -111,6 +122,9 @@ class Flight:
     phase_since_ns: int = 0
     positions: PositionWatch = field(init=False)
     _orders: _Orders = field(default_factory=_Orders)
+    _fell_ns: int | None = None
+    _disarmed_ns: int | None = None
+    """when a flight of ours, or of the pilot's after us, was seen to be over"""
     _mode_before: int | None = None
     """custom_mode at arming, until the take-off: the vehicle may stay in it"""
     _unpositioned: bool = False
@@ -199,7 +213,7 @@ class Flight:
         self._happened(PhaseEvent.GIVEN_AWAY, now)
         self.autopilot.cancel()
         self.autopilot.ask("kill", *wire.kill_parameters())
-        self._orders.kill_ns = now.monotonic_ns
+        self._orders.kill_ns, self._orders.kill_armed = now.monotonic_ns, self.autopilot.armed
         self.notes.append("killed by command: the motors are stopped")
         return None
 
@@ -245,6 +259,11 @@ class Flight:
             return
         ap = self.autopilot
         self.notes.append(f"{before.name.lower()} -> {after.name.lower()}: {event.value}")
+        self.events.append(PhaseChanged(before, after))
+        if event is PhaseEvent.DISARMED:
+            self._disarmed_ns = now.monotonic_ns
+        elif event is PhaseEvent.TAKE_OFF:
+            self.killed = self._fell_ns = self._disarmed_ns = None
         self.phase = after
         self.phase_since_ns = now.monotonic_ns
         if after is Phase.ARMED:
@@ -273,6 +292,7 @@ class Flight:
         sentence = f"{what.value}: {detail}: {chosen.value}" if detail else f"{what.value}: {chosen.value}"
         self.failsafes.append(sentence)
         self.notes.append(f"failsafe: {sentence}")
+        self.events.append(FailsafeActed(what, sentence))
         match chosen:
             case Action.LAND:
                 self._happened(PhaseEvent.LAND, now)
@@ -301,6 +321,7 @@ class Flight:
         """Lead the autopilot through the flight, and notice when something fails."""
         ap = self.autopilot
         self._watch_orders(now)
+        self._watch_fall(now)
         if self.positions.jumps != self._jumps and (self.phase not in FLYING_PHASES or ap.landed_state == ON_GROUND):
             # PX4's estimator resets on the ground too, seconds before arming: there is nothing to hold yet.
             self._jumps = self.positions.jumps
@@ -325,12 +346,28 @@ class Flight:
             case phase if phase in FILTERED_PHASES:
                 self._watch_flight(now, positioned)
 
+    def _watch_fall(self, now: Instant) -> None:
+        """Notice motors that stopped in the air: whoever does it disarms a vehicle that falls."""
+        if self.autopilot.velocity_ned_m_s.down > FALL_M_S:
+            self._fell_ns = now.monotonic_ns
+        fell, disarmed = self._fell_ns, self._disarmed_ns
+        if fell is not None and disarmed is not None and abs(fell - disarmed) <= FALL_NS:
+            self._note_killed(KillCause.FELL)
+
+    def _note_killed(self, cause: KillCause) -> None:
+        if self.killed is None:
+            self.killed = cause
+            self.notes.append(f"killed: {cause.value}")
+            self.events.append(Killed(cause))
+
     def _watch_orders(self, now: Instant) -> None:
         ap, orders = self.autopilot, self._orders
         if orders.kill_ns is not None:
             # What was believed before the kill may be a heartbeat old.
             stopped = not ap.armed and ap.heartbeat_ns is not None and ap.heartbeat_ns > orders.kill_ns
             if stopped or now.monotonic_ns - orders.kill_ns > KILL_LIMIT_NS:
+                if stopped and orders.kill_armed:
+                    self._note_killed(KillCause.COMMAND)
                 # A retry would stop the motors of a later flight.
                 ap.withdraw("kill")
                 orders.kill_ns = None

@@ -16,6 +16,7 @@ from companion.config import FleetConfig
 from companion.core.failsafe import Failsafe
 from companion.core.frames import Ned
 from companion.core.values import Instant, Phase
+from companion.wire.events import encode_event
 from sim.autopilot import Autopilot
 from sim.network import Network, NetworkParameters
 from sim.stub_fleet import stub_settings
@@ -194,6 +195,8 @@ class Lockstep:
                 arrival = None if j == i else self._net.arrival_ns(i, j, self.now_ns)
                 if arrival is not None:
                     self._at(arrival, lambda j=j, p=payload, k=key: self._to_peer(j, k, p))  # type: ignore[misc]
+        for event in out.events:
+            self._log(i, "event", encode_event(event))
         self.notes += [(self.now_ns * 1e-9, i, note) for note in out.notes]
 
     def _to_peer(self, j: int, key: str, payload: bytes) -> None:
@@ -216,6 +219,7 @@ class Lockstep:
             if v.alive and (not ids or i in ids):
                 self._log(i, "input/command", payload)
                 answers[i] = v.agent.receive_command(payload, self.now)
+                self._log(i, "output/answer", answers[i])
         return answers
 
     def _in_order(self, payload: bytes) -> bytes:

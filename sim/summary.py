@@ -13,21 +13,36 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from companion.agent import adoption_note
 from companion.config import FleetConfig
+from companion.core.counts import Refusal
+from companion.core.events import Event, FailsafeActed, Killed, MotionAdopted, PhaseChanged
 from companion.core.monitor import algebraic_connectivity, centroid_error_m, formation_error_m, velocity_error_m_s
 from companion.core.plan import Motion, Programme
-from companion.errors import WireError
+from companion.core.values import FLYING_PHASES, Phase
 from companion.io.loop import TICK_RECORD, TRAFFIC_RECORD
 from companion.io.recorder import Entry
+from companion.orders import Order, read_order
+from companion.wire.events import decode_event
 from companion.wire.mavlink import Px4Mode
-from companion.wire.peer import decode_motion
+from companion.wire.peer import encode_motion
 
 Array = npt.NDArray[Any]
 SETTLING_S = 3.0
 """left out of the steady part after forming and after a change of formation"""
 WINDOW_S = 10.0
 ON_GROUND = 1
+ALOFT_M = 0.3
+"""a vehicle so far above the lowest place where it was is in the air, whatever its land detector says: PX4 takes what
+is disarmed for landed"""
+TOUCHDOWN_HEIGHT_M = 0.5
+TOUCHDOWN_MAX_M_S = 2.0
+"""nobody comes down faster than this over the last TOUCHDOWN_HEIGHT_M: PX4 lands at 0.7 m/s, and a fall from 0.2 m ends
+at this"""
+SETPOINT_GAP_MAX_S = 0.5
+"""half of the COM_OF_LOSS_T of 1.0 s after which the autopilot's failsafe acts"""
+COMMANDS_TOLD_MOST = 1000
+LEFT_FORMATION = frozenset({Phase.IDLE, Phase.RETURNING, Phase.LANDING, Phase.LANDED, Phase.RELEASED})
+"""phases with which the steady part ends"""
 REFERENCE_HZ = 20.0
 BELIEVED_STEP_NS = 100_000_000
 BELIEVED = ("formation_error_rms_m", "velocity_error_rms_m_s", "centroid_error_rms_m", "altitude_error_max_m")
@@ -44,6 +59,20 @@ class Put:
 
 
 @dataclass(slots=True)
+class Command:
+    """One command of an operator, and what the vehicles answered."""
+
+    time_ns: int
+    """when the first vehicle had it"""
+    order: Order
+    accepted: list[int] = field(default_factory=list)
+    refused: dict[int, str] = field(default_factory=dict)
+    """vehicle -> why"""
+    unanswered: list[int] = field(default_factory=list)
+    """whoever had it and ended before its answer"""
+
+
+@dataclass(slots=True)
 class Flight:
     """Everything that is known of one flight. Times are fleet time (UTC, ns)."""
 
@@ -56,24 +85,29 @@ class Flight:
     """how far the centroid may be from the plan, in truth: an estimator with a GPS of its own is off by more"""
     disarmed: Mapping[int, bool] = field(default_factory=dict)
     """vehicle -> whether its companion said so last; asked where there is no truth"""
-    motions: list[Motion] = field(default_factory=list)
+    commands: dict[bytes, Command] = field(default_factory=dict)
+    """payload -> command; the same bytes again are a retry"""
+    commands_unread: int = 0
+    """what came as a command and was none"""
     puts: list[Put] = field(default_factory=list)
-    notes: list[tuple[int, int, str]] = field(default_factory=list)
+    events: list[tuple[int, int, Event]] = field(default_factory=list)
     """(time, vehicle, what happened)"""
     ticks: dict[int, Array] = field(default_factory=dict)
     """vehicle -> rows of fleet ns and the fields of TICK_RECORD"""
     traffic: dict[int, Array] = field(default_factory=dict)
     """vehicle -> rows of (fleet ns, bytes sent)"""
     rejected: Counter[str] = field(default_factory=Counter)
-    failsafes: list[str] = field(default_factory=list)
     lost: frozenset[int] = frozenset()
     """vehicles whose companion ended in flight"""
+    autopilots_lost: Mapping[int, str] = field(default_factory=dict)
+    """vehicle -> how its autopilot ended in flight"""
     reference_lateness_ns: Array | None = None
     versions: Mapping[str, str] = field(default_factory=dict)
 
     def read(self, vehicle_id: int, entries: Iterable[Entry]) -> None:
         """Take one companion's recording."""
         ticks, traffic = [], []
+        asked: Command | None = None
         for entry in entries:
             now = entry.instant.fleet_ns
             match entry.channel:
@@ -81,60 +115,99 @@ class Flight:
                     ticks.append((now, *TICK_RECORD.unpack(entry.body)))
                 case "traffic":
                     traffic.append((now, *TRAFFIC_RECORD.unpack(entry.body)))
-                case "note":
-                    self.note(now, vehicle_id, entry.body.decode())
+                case "event":
+                    self.events.append((now, vehicle_id, decode_event(entry.body)))
                 case "output/peer":
                     topic, _, payload = entry.body.partition(b"\0")
-                    self.put(now, vehicle_id, topic.decode(), payload)
+                    self.puts.append(Put(now, vehicle_id, topic.decode(), len(payload)))
                 case "input/command":
-                    self._command(entry.body)
+                    asked = self._command(now, vehicle_id, entry.body)
+                case "output/answer":
+                    if asked is not None:
+                        _answer(asked, vehicle_id, entry.body)
+                    asked = None
         self.ticks[vehicle_id] = np.array(ticks, dtype=float).reshape(-1, 13)
         self.traffic[vehicle_id] = np.array(traffic, dtype=float).reshape(-1, 2)
 
-    def note(self, time_ns: int, vehicle_id: int, text: str) -> None:
-        """Take one note of a companion's."""
-        self.notes.append((time_ns, vehicle_id, text))
-        if text.startswith("failsafe: "):
-            self.failsafes.append(f"vehicle {vehicle_id}: {text.removeprefix('failsafe: ')}")
+    def _command(self, time_ns: int, vehicle_id: int, payload: bytes) -> Command | None:
+        order = read_order(payload)
+        if isinstance(order, Refusal):
+            self.commands_unread += 1
+            return None
+        command = self.commands.setdefault(payload, Command(time_ns, order))
+        command.time_ns = min(command.time_ns, time_ns)
+        if vehicle_id not in (*command.accepted, *command.refused, *command.unanswered):
+            command.unanswered.append(vehicle_id)
+        return command
 
-    def put(self, time_ns: int, vehicle_id: int, topic: str, payload: bytes) -> None:
-        """Take one message of a companion's."""
-        self.puts.append(Put(time_ns, vehicle_id, topic, len(payload)))
-        if topic == "plan":
-            self.motions.append(decode_motion(payload))
-
-    def _command(self, body: bytes) -> None:
-        try:
-            command = json.loads(body)
-            if command["verb"] == "motion":
-                self.motions.append(decode_motion(json.dumps(command["motion"]).encode()))
-        except (ValueError, KeyError, TypeError, RecursionError, WireError):
-            return  # the vehicle has refused and counted it
+    @property
+    def staying(self) -> list[int]:
+        """Vehicles whose companions flew to the end."""
+        return [v.id for v in self.config.vehicles if v.id not in self.lost]
 
     def programme(self) -> Programme:
-        """The motions that won, one of each revision; what every vehicle refused is not among them."""
+        """The motions that most of the vehicles flew by, one of each revision.
+
+        Most, of those whose companions flew to the end: what one vehicle adopted and the others refused is no motion of
+        the formation. Of two of one revision that most adopted, the one that wins with every vehicle.
+        """
+        adopted: dict[bytes, tuple[Motion, set[int]]] = {}
+        for _, i, event in self.events:
+            if isinstance(event, MotionAdopted) and i in self.staying:
+                adopted.setdefault(encode_motion(event.motion), (event.motion, set()))[1].add(i)
         best: dict[int, Motion] = {0: self.config.first_motion}
-        adopted = {text for _, _, text in self.notes}
-        for motion in self.motions:
-            if adoption_note(motion) not in adopted:
-                continue
-            if motion.revision not in best or motion.order > best[motion.revision].order:
+        for motion, by in sorted(adopted.values(), key=lambda flown: flown[0].order):
+            if 2 * len(by) > len(self.staying):
                 best[motion.revision] = motion
         return Programme([best[r] for r in sorted(best)])
+
+
+def _answer(command: Command, vehicle_id: int, body: bytes) -> None:
+    """Keep a vehicle's first answer: a retry gets the same."""
+    if vehicle_id not in command.unanswered:
+        return
+    command.unanswered.remove(vehicle_id)
+    said = json.loads(body)
+    if said["accepted"]:
+        command.accepted.append(vehicle_id)
+    else:
+        command.refused[vehicle_id] = said["reason"]
+
+
+@dataclass(frozen=True, slots=True)
+class _Truth:
+    """Truth over (time, vehicle); where a vehicle's record has not begun or has ended its numbers are NaN."""
+
+    times_ns: Array
+    position_ned_m: Array
+    velocity_ned_m_s: Array
+    mode: Array
+    known: npt.NDArray[np.bool_]
+    aloft: npt.NDArray[np.bool_]
+    flies: npt.NDArray[np.bool_]
+    """armed, and aloft by its land detector"""
+    down: dict[int, bool]
+    """vehicle -> whether it was on the ground and disarmed when its record ended"""
+    gap_max_s: float | None
+    """longest time without a setpoint in OFFBOARD, of any vehicle; None where the simulator does not tell"""
+    touchdown_m_s: float | None
+    """largest downward speed just above the ground"""
 
 
 def summarise(flight: Flight) -> dict[str, Any]:
     """The flight's figures, as summary.json holds them."""
     config = flight.config
     ids = [v.id for v in config.vehicles]
-    staying = [i for i in ids if i not in flight.lost]
-    times, position, velocity, mode, landed, armed, gap = _arrays(flight.truth, ids)
+    staying = flight.staying
+    truth = _truth(flight.truth, ids)
+    times = truth.times_ns
     formed_ns = _formed_ns(flight, staying)
     programme = flight.programme()
     columns = [ids.index(i) for i in staying]
     known = len(times) > 0
     if known:
-        steady = _steady(flight, programme, times, formed_ns) & (mode[:, columns] == Px4Mode.OFFBOARD).all(axis=1)
+        follows = truth.flies & (truth.mode == Px4Mode.OFFBOARD)
+        steady = _steady(flight, programme, times, formed_ns) & follows[:, columns].all(axis=1)
         seconds = float(steady.sum()) * _step_s(times)
         window = (int(times[steady][0]), int(times[steady][-1])) if steady.any() else (0, 0)
     else:
@@ -143,18 +216,21 @@ def summarise(flight: Flight) -> dict[str, Any]:
         steady = np.zeros(0, bool)
         seconds = len(inside) * BELIEVED_STEP_NS * 1e-9
         window = (int(inside[0]), int(inside[-1])) if len(inside) else (0, 0)
-    figures = _errors(programme, staying, times[steady], position[steady][:, columns], velocity[steady][:, columns])
+    figures = _errors(
+        programme, staying, times[steady], truth.position_ned_m[steady][:, columns],
+        truth.velocity_ned_m_s[steady][:, columns],
+    )  # fmt: skip
     puts = [p for p in flight.puts if window[0] <= p.time_ns <= window[1] and p.vehicle_id in staying]
     rate = len(puts) / max(len(staying), 1) / seconds if seconds else None
-    minimum, minimum_at_s = _minimum_distance(flight, times, position, landed)
+    minimum, minimum_at_s = _minimum_distance(flight.takeoff_ns, truth)
     ticks = [t for i, t in flight.ticks.items() if len(t)]
     believed = _believed(flight, programme, staying, formed_ns, window)
     in_window = [t[(t[:, 0] >= window[0]) & (t[:, 0] <= window[1])] for t in ticks]
     every = np.concatenate(in_window) if in_window else np.zeros((0, 13))
     driven = every[every[:, 2] >= 0.0] if len(every) else every
-    ended = {i: bool(armed[-1, k] == 0 and landed[-1, k] == ON_GROUND) for k, i in enumerate(ids)} if known else {}
-    if not known:
-        ended = {i: flight.disarmed.get(i, False) for i in ids}
+    ended = truth.down if known else {i: flight.disarmed.get(i, False) for i in ids}
+    gap = truth.gap_max_s if truth.gap_max_s is not None else _sent_gap_max_s(flight)
+    commands = sorted(flight.commands.values(), key=lambda c: (c.time_ns, c.order.rank))
     summary: dict[str, Any] = {
         "vehicles": len(ids),
         "judged_by": "truth" if known else "the vehicles' own estimates",
@@ -177,14 +253,19 @@ def summarise(flight: Flight) -> dict[str, Any]:
             "nearest_neighbour_m": _round(float(every[:, 5].min())) if len(every) else None,
         },
         "setpoint_rate_hz": _round(_per_vehicle(float(every[:, 6].sum()), ids, seconds)) if len(every) else None,
-        "setpoint_gap_max_s": _round(float(gap.max())) if gap.size and np.isfinite(gap.max()) else None,
+        "setpoint_gap_max_s": _round(gap),
         "loop_lateness_ms": _percentiles(every[:, 1]),
         "latency_ms": _percentiles(driven[:, 2]),
         "reference_lateness_ms": _percentiles(flight.reference_lateness_ns),
         "cpu_per_tick_ms": _cpu_per_tick(in_window),
         "landed": ended,
+        "touchdown_max_m_s": _round(truth.touchdown_m_s),
+        "killed": {i: e.cause.value for _, i, e in flight.events if isinstance(e, Killed)},
         "lost": sorted(flight.lost),
-        "failsafes": flight.failsafes,
+        "autopilots_lost": dict(flight.autopilots_lost),
+        "failsafes": [f"vehicle {i}: {e.sentence}" for _, i, e in flight.events if isinstance(e, FailsafeActed)],
+        "commands": [_told(c, flight.takeoff_ns) for c in commands[:COMMANDS_TOLD_MOST]],
+        "commands_left_out": flight.commands_unread + max(len(commands) - COMMANDS_TOLD_MOST, 0),
         "rejected": dict(flight.rejected),
         "control_rate_hz": config.limits.control_rate_hz,
         "seed": flight.seed,
@@ -194,40 +275,95 @@ def summarise(flight: Flight) -> dict[str, Any]:
     return {"passed": all(c["met"] for c in summary["criteria"]), **summary}
 
 
-def _arrays(truth: Array, ids: Sequence[int]) -> tuple[Array, ...]:
-    """Truth as arrays over (time, vehicle), at the times of the first; where a vehicle is missing there is none."""
-    per_vehicle = [truth[truth["vehicle_id"] == i] for i in ids]
-    if not all(len(mine) > 1 for mine in per_vehicle):
-        return tuple(np.zeros((0, len(ids), *s)) for s in ((), (3,), (3,), (), (), (), ()))
-    per_vehicle = [mine[np.argsort(mine["time_unix_ns"], kind="stable")] for mine in per_vehicle]
-    common = per_vehicle[0]["time_unix_ns"]
-    begin, end = max(m["time_unix_ns"][0] for m in per_vehicle), min(m["time_unix_ns"][-1] for m in per_vehicle)
-    common = common[(common >= begin) & (common <= end)]
-    # Simulators tell their vehicles' states at times of their own: motion is interpolated, the rest is the latest.
-    latest = [m[np.searchsorted(m["time_unix_ns"], common, side="right") - 1] for m in per_vehicle]
+def _told(command: Command, takeoff_ns: int) -> dict[str, Any]:
+    order = command.order
+    return {
+        "at_s": _round((command.time_ns - takeoff_ns) * 1e-9),
+        "verb": order.verb,
+        "revision": order.revision,
+        "issuer": order.issuer,
+        "accepted": sorted(command.accepted),
+        "refused": dict(sorted(command.refused.items())),
+        "unanswered": sorted(command.unanswered),
+    }
 
-    def motion(name: str) -> Array:
-        return np.stack(
-            [
-                np.stack([np.interp(common, m["time_unix_ns"], m[name][:, k].astype(float)) for k in range(3)], axis=1)
-                for m in per_vehicle
-            ],
-            axis=1,
+
+def _truth(records: Array, ids: Sequence[int]) -> _Truth:
+    """Truth as arrays over (time, vehicle): at the times of the vehicle that was recorded longest, and of the others
+    before and after it, so that nobody's end hides what the rest does.
+
+    Simulators tell their vehicles' states at times of their own: motion is interpolated, the rest is the latest.
+    """
+    rows = {i: records[records["vehicle_id"] == i] for i in ids} if len(records) else {}
+    rows = {i: mine[np.argsort(mine["time_unix_ns"], kind="stable")] for i, mine in rows.items() if len(mine) > 1}
+    if not rows:
+        none = np.zeros((0, len(ids)))
+        never = none.astype(bool)
+        return _Truth(
+            none[:, 0], np.zeros((0, len(ids), 3)), np.zeros((0, len(ids), 3)), none, *(never,) * 3, {}, None, None
         )
-
-    return (
-        common, motion("position_ned_m"), motion("velocity_ned_m_s"),
-        *(np.stack([m[name] for m in latest], axis=1) for name in (
-            "custom_mode", "landed_state", "armed", "setpoint_gap_max_s"
-        )),
+    times = max(rows.values(), key=lambda mine: mine["time_unix_ns"][-1] - mine["time_unix_ns"][0])["time_unix_ns"]
+    for mine in rows.values():
+        own = mine["time_unix_ns"]
+        times = np.concatenate([own[own < times[0]], times, own[own > times[-1]]])
+    shape = (len(times), len(ids))
+    position, velocity = (np.full((*shape, 3), np.nan) for _ in range(2))
+    mode, armed, landed = (np.zeros(shape, np.int64) for _ in range(3))
+    motion: tuple[tuple[Array, str], ...] = ((position, "position_ned_m"), (velocity, "velocity_ned_m_s"))
+    state: tuple[tuple[Array, str], ...] = ((mode, "custom_mode"), (armed, "armed"), (landed, "landed_state"))
+    known = np.zeros(shape, bool)
+    for k, i in enumerate(ids):
+        if (mine := rows.get(i)) is None:
+            continue
+        own = mine["time_unix_ns"]
+        inside = known[:, k] = (times >= own[0]) & (times <= own[-1])
+        for values, name in motion:
+            for axis in range(3):
+                values[inside, k, axis] = np.interp(times[inside], own, mine[name][:, axis].astype(float))
+        latest = mine[np.searchsorted(own, times[inside], side="right") - 1]
+        for values, name in state:
+            values[inside, k] = latest[name]
+    with np.errstate(invalid="ignore"):
+        height = np.nanmax(np.where(known, position[:, :, 2], -np.inf), axis=0) - position[:, :, 2]
+        detected = known & (landed != ON_GROUND)
+        aloft = detected | (known & (height > ALOFT_M))
+    gaps = [float(mine["setpoint_gap_max_s"].max()) for mine in rows.values()]
+    return _Truth(
+        times, position, velocity, mode, known, aloft, detected & (armed != 0),
+        {i: i in rows and bool(rows[i]["armed"][-1] == 0 and rows[i]["landed_state"][-1] == ON_GROUND) for i in ids},
+        max(gaps) if np.isfinite(gaps).all() else None,
+        max(_touchdown_m_s(mine) for mine in rows.values()),
     )  # fmt: skip
+
+
+def _touchdown_m_s(mine: Array) -> float:
+    """Largest downward speed within TOUCHDOWN_HEIGHT_M of the lowest place of one vehicle's record."""
+    down = mine["position_ned_m"][:, 2].astype(float)
+    low = down > down.max() - TOUCHDOWN_HEIGHT_M
+    return max(float(mine["velocity_ned_m_s"][low, 2].max()), 0.0)
+
+
+def _sent_gap_max_s(flight: Flight) -> float | None:
+    """Longest time between two setpoints that companions sent while they steered; None if nobody did."""
+    longest = 0.0
+    for i, rows in flight.ticks.items():
+        sent = rows[rows[:, 6] > 0.0, 0]
+        ends = [
+            t for t, k, e in flight.events if k == i and isinstance(e, PhaseChanged) and e.after not in FLYING_PHASES
+        ]
+        for k in np.argsort(-np.diff(sent)):
+            before, after = sent[k], sent[k + 1]
+            if not any(before <= t <= after for t in ends):
+                longest = max(longest, float(after - before) * 1e-9)
+                break
+    return longest or None
 
 
 def _formed_ns(flight: Flight, staying: Sequence[int]) -> int | None:
     """When the last vehicle first reported that it had formed."""
     first: dict[int, int] = {}
-    for time_ns, i, text in flight.notes:
-        if "-> formed" in text:
+    for time_ns, i, event in flight.events:
+        if isinstance(event, PhaseChanged) and event.after is Phase.FORMED:
             first[i] = min(time_ns, first.get(i, time_ns))
     return max(first[i] for i in staying) if staying and all(i in first for i in staying) else None
 
@@ -237,13 +373,13 @@ def _steady(flight: Flight, programme: Programme, times: Array, formed_ns: int |
     if formed_ns is None or not len(times):
         return np.zeros(len(times), bool)
     steady = times >= formed_ns + round(SETTLING_S * 1e9)
-    landing = [
+    left = [
         t
-        for t, i, text in flight.notes
-        if ("-> landing" in text or "-> returning" in text) and t > formed_ns and i not in flight.lost
+        for t, i, event in flight.events
+        if isinstance(event, PhaseChanged) and event.after in LEFT_FORMATION and t > formed_ns and i not in flight.lost
     ]
-    if landing:
-        steady &= times < min(landing)
+    if left:
+        steady &= times < min(left)
     for motion in programme.motions[1:]:
         if motion.blend_start_ns == motion.start_ns:
             steady &= (times < motion.start_ns) | (times > motion.blend_end_ns + round(SETTLING_S * 1e9))
@@ -329,21 +465,19 @@ def _attitude_rate(truth: Array, window: tuple[int, int]) -> float | None:
     return _round(float(np.degrees(_rms(rates)))) if len(rates) and np.isfinite(rates).all() else None
 
 
-def _minimum_distance(
-    flight: Flight, times: Array, position: Array, landed: Array
-) -> tuple[float | None, float | None]:
+def _minimum_distance(takeoff_ns: int, truth: _Truth) -> tuple[float | None, float | None]:
     """Smallest true distance of any pair of which one is in the air, and when (s after take-off)."""
     best, best_at = None, None
-    n = position.shape[1] if position.ndim == 3 else 0
-    i, j = np.triu_indices(n, 1)
+    times, position, aloft = truth.times_ns, truth.position_ned_m, truth.aloft
+    i, j = np.triu_indices(position.shape[1], 1)
     for start in range(0, len(times), 500):
         part = slice(start, start + 500)
         distance = np.linalg.norm(position[part][:, i] - position[part][:, j], axis=2)
-        flying = (landed[part][:, i] != ON_GROUND) | (landed[part][:, j] != ON_GROUND)
-        distance = np.where(flying & (times[part] >= flight.takeoff_ns)[:, None], distance, np.inf)
+        judged = (aloft[part][:, i] | aloft[part][:, j]) & np.isfinite(distance)
+        distance = np.where(judged & (times[part] >= takeoff_ns)[:, None], distance, np.inf)
         if distance.size and np.isfinite(distance.min()) and (best is None or distance.min() < best):
             best = float(distance.min())
-            best_at = (times[part][int(distance.min(axis=1).argmin())] - flight.takeoff_ns) * 1e-9
+            best_at = float(times[part][int(distance.min(axis=1).argmin())] - takeoff_ns) * 1e-9
     return _round(best), _round(best_at)
 
 
@@ -400,7 +534,11 @@ def _criteria(summary: Mapping[str, Any], config: FleetConfig, centroid_limit_m:
         *([(distance, nearest, ">=", 0.3 * spacing)] if len(config.vehicles) > 1 else []),
         (f"{source}.formation_error_rms_m", summary[source]["formation_error_rms_m"], "<=", 0.075 * spacing),
         (f"{source}.centroid_error_rms_m", summary[source]["centroid_error_rms_m"], "<=", centroid_limit_m),
+        ("setpoint_gap_max_s", summary["setpoint_gap_max_s"], "<=", SETPOINT_GAP_MAX_S),
+        *([("touchdown_max_m_s", summary["touchdown_max_m_s"], "<=", TOUCHDOWN_MAX_M_S)] if source == "steady" else []),
         ("failsafes", len(summary["failsafes"]), "<=", 0),
+        ("vehicles killed", len(summary["killed"]), "<=", 0),
+        ("autopilots lost", len(summary["autopilots_lost"]), "<=", 0),
         ("vehicles not landed and disarmed", sum(not x for x in summary["landed"].values()), "<=", 0),
         ("companions lost", len(summary["lost"]), "<=", 0),
     ]

@@ -33,6 +33,7 @@ from companion.io.systemd import Notifier
 from companion.io.traffic import tcp_bytes_sent
 from companion.io.zenoh_peers import PeerMessage, PeerNetwork, PeerNetworkSettings, PresenceChange, Request
 from companion.preflight import ClockReading
+from companion.wire.events import encode_event
 
 TICK_RECORD = struct.Struct("<qqqff?6f")
 """body of the "tick" channel: lateness ns, sensor-to-setpoint latency ns (-1 for a timer's tick), CPU ns of the loop so
@@ -258,6 +259,8 @@ class Companion:
             self._record("output/mavlink", now, datagram)
         for topic, payload in out.peers:
             self._record("output/peer", now, topic.encode() + b"\0" + payload)
+        for event in out.events:
+            self._record("event", now, encode_event(event))
         for note in out.notes:
             self._record("note", now, note.encode())
             with suppress(OSError):  # a full disk must not end a flight; the recording counts its own losses
@@ -276,7 +279,9 @@ class Companion:
         now = self._instant(time.monotonic_ns())
         if request.kind == "command":
             self._record("input/command", now, request.payload)
-            request.reply(self.agent.receive_command(request.payload, now))
+            answer = self.agent.receive_command(request.payload, now)
+            self._record("output/answer", now, answer)
+            request.reply(answer)
             return
         if request.kind == "preflight":
             request.reply(self._preflight(request, now))
