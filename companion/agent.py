@@ -751,6 +751,7 @@ class Agent:
             "messages": self.messages_sent,
             "setpoints": self.setpoints_sent,
             "battery_percent": self.autopilot.battery(now),
+            "autopilot_age_s": self.autopilot.heartbeat_age_s(now),
             "configuration": self.config.shared_hash,
             "failsafes": list(self.flight.failsafes),
             "rejected": dict(

@@ -424,6 +424,10 @@ class AutopilotClient:
         """Age of the latest position (s); infinite before the first."""
         return inf if self.position_ns is None else (now.monotonic_ns - self.position_ns) * 1e-9
 
+    def heartbeat_age_s(self, now: Instant) -> float | None:
+        """Age of the latest heartbeat (s); None before the first."""
+        return None if self.heartbeat_ns is None else (now.monotonic_ns - self.heartbeat_ns) * 1e-9
+
     def state(self, now: Instant) -> tuple[Ned, Ned] | None:
         """Position and velocity now (fleet frame), the latest carried on by its age; None if stale or without frame."""
         if self.position_ns is None or self.frame is None:
@@ -449,10 +453,9 @@ class AutopilotClient:
 
     def facts(self, now: Instant) -> AutopilotFacts:
         """What preflight looks at."""
-        heartbeat = self.heartbeat_ns
         flags, accuracy_m = self.estimator(now)
         return AutopilotFacts(
-            heartbeat_age_s=None if heartbeat is None else (now.monotonic_ns - heartbeat) * 1e-9,
+            heartbeat_age_s=self.heartbeat_age_s(now),
             foreign_system_id=self.link.foreign_system_id if _within(self.foreign_ns, HEARTBEAT_LIMIT_S, now) else None,
             autopilot_kind=self.autopilot_kind,
             vehicle_type=self.vehicle_type,

@@ -25,6 +25,7 @@ from companion.io.zenoh_peers import OperatorLink
 from companion.operate import Answers, Operator, PreflightError
 from sim.faults import ScheduledFault, order_fault
 from sim.reference_loop import read_reference_loop
+from sim.sitl import read_ended
 from sim.stubs import TRUTH_DTYPE
 from sim.summary import Flight, summarise
 
@@ -34,6 +35,8 @@ LANDING_TIMEOUT_S = 90.0
 POLL_S = 1.0
 TAKE_OFF_GRACE_S = 15.0
 """a vehicle that is still on the ground by then has given its take-off up"""
+UNHEARD_S = 15.0
+"""an autopilot silent for so long will not tell of its landing any more"""
 END_TIMEOUT_S = 5.0
 CROWD = 15
 CROWD_NICENESS = 10
@@ -72,6 +75,8 @@ class Progress:
     vehicles: Mapping[int, Mapping[str, Any] | None]
     ended: Mapping[int, int]
     """vehicle -> exit status of its companion, where it has ended"""
+    autopilots_ended: Mapping[int, str] = field(default_factory=dict)
+    """vehicle -> how its autopilot has ended"""
 
 
 @dataclass(slots=True)
@@ -204,13 +209,13 @@ def _fly(
         _wait_imported(processes, folder, ids, lambda: show(_starting(began, ids)), interrupted)
     with OperatorLink(network_settings(config, None)) as link:
         operator = Operator(config, link)
-        watch = _Watch(operator, processes, ids, show, began)
+        watch = Watch(operator, processes, ids, show, began)
         answers = watch.take_off(READY_TIMEOUT_S + READY_TIMEOUT_PER_VEHICLE_S * len(ids), interrupted)
         takeoff_ns = watch.asked_ns
         if not answers.all_accepted:
             raise RefusedError(answers.sentence("take-off"))
         lost = watch.fly(options.duration_s, options.faults, interrupted)
-        final = watch.said
+        final, autopilots_lost = watch.said, watch.autopilots_ended()
     processes.end([f"companion-{i}" for i in ids], END_TIMEOUT_S)
     processes.end([n for n in ("autopilots", "reference") if n in processes.children], AUTOPILOTS_GRACE_S)
     flight = Flight(
@@ -220,6 +225,7 @@ def _fly(
         takeoff_ns=takeoff_ns,
         centroid_limit_m=0.5 if options.px4 is None else 1.0,
         lost=lost,
+        autopilots_lost=autopilots_lost,
         disarmed={i: not said["armed"] for i, said in final.items()},
         versions={"python": sys.version.split()[0], **{name: version(name) for name in LIBRARIES}},
     )
@@ -278,7 +284,7 @@ def _wait_imported(
 
 
 @dataclass(slots=True)
-class _Watch:
+class Watch:
     """The launcher's eye on a flight: it asks once a second, shows, and notices who has gone."""
 
     operator: Operator
@@ -290,11 +296,13 @@ class _Watch:
     """each vehicle's last account"""
     asked_ns: int = 0
     """when the take-off was last commanded (UTC)"""
+    clock: Callable[[], float] = time.monotonic
+    sleep: Callable[[float], None] = time.sleep
 
     def _look(self, doing: str) -> dict[int, dict[str, Any] | None]:
         answers = self.operator.status()
         self.said.update({i: s for i, s in answers.items() if s is not None})
-        self.show(Progress(time.monotonic() - self.began, doing, answers, self.ended()))
+        self.show(Progress(self.clock() - self.began, doing, answers, self.ended(), self.autopilots_ended()))
         return answers
 
     def ended(self) -> dict[int, int]:
@@ -302,21 +310,25 @@ class _Watch:
         status = {i: self.processes.exit_status(f"companion-{i}") for i in self.ids}
         return {i: s for i, s in status.items() if s is not None}
 
+    def autopilots_ended(self) -> dict[int, str]:
+        """Autopilots whose own process has ended, and how."""
+        return read_ended(self.processes.folder)
+
     def take_off(self, timeout_s: float, interrupted: Callable[[], bool]) -> Answers:
         """Wait until every vehicle is ready, look at the fleet as a whole, and take off.
 
         Raises PreflightError as soon as a fault shows that no waiting heals, and when the time is up.
         """
-        deadline = time.monotonic() + timeout_s
+        deadline = self.clock() + timeout_s
         while True:
             self._until_ready(deadline, interrupted)
             self.asked_ns = time.time_ns()
             try:
                 return self.operator.take_off()
             except PreflightError as error:
-                if error.report.lasting or time.monotonic() > deadline:
+                if error.report.lasting or self.clock() > deadline:
                     raise
-            time.sleep(0.3)
+            self.sleep(0.3)
 
     def _until_ready(self, deadline: float, interrupted: Callable[[], bool]) -> None:
         """Wait until every vehicle says that it may take off, or one that it cannot, or the time is up."""
@@ -325,6 +337,8 @@ class _Watch:
             for name in self.processes.children:
                 if self.processes.exit_status(name) is not None:
                     raise CompanionError(self.processes.obituary(name, "before take-off"))
+            for i, how in self.autopilots_ended().items():
+                raise CompanionError(f"vehicle {i}: {how} before take-off")
             answers = self._look("starting")
             if all(s is not None and not s["ready"] for s in answers.values()):
                 return
@@ -332,38 +346,45 @@ class _Watch:
                 raise CompanionError("interrupted before take-off")
             # Once all speak, so that all are named; seen twice, since what comes in at the start has no order.
             unfit = all(s is not None for s in answers.values()) and any(s["unfit"] for s in answers.values() if s)
-            if (unfit and unfit_before) or time.monotonic() > deadline:
+            if (unfit and unfit_before) or self.clock() > deadline:
                 return
             unfit_before = unfit
-            time.sleep(0.3)
+            self.sleep(0.3)
 
     def fly(
         self, duration_s: float | None, faults: tuple[ScheduledFault, ...], interrupted: Callable[[], bool]
     ) -> frozenset[int]:
         """Watch until all have landed; returns the vehicles whose companion ended before."""
-        start = time.monotonic()
+        start = self.clock()
         coming = list(faults)
         landing_since: float | None = None
         while True:
             answers = self._look("landing" if landing_since is not None else "flying")
             lost = frozenset(self.ended())
-            staying = [s for i, s in answers.items() if i not in lost and s is not None]
-            if len(lost) == len(self.ids):
+            gone = lost | frozenset(self.autopilots_ended())
+            staying = [s for i, s in answers.items() if i not in gone and s is not None]
+            if len(gone) == len(self.ids):
                 return lost
             if "autopilots" in self.processes.children and self.processes.exit_status("autopilots") is not None:
                 raise CompanionError(self.processes.obituary("autopilots", "in flight"))
-            tried = time.monotonic() - start > TAKE_OFF_GRACE_S
+            tried = self.clock() - start > TAKE_OFF_GRACE_S
             down = ("landed", "released", "idle") if tried else ("landed", "released")
-            done = [s["phase"] in down and not s["armed"] for s in staying]
-            if staying and all(done) and len(staying) + len(lost) == len(self.ids):
+            done = [(s["phase"] in down and not s["armed"]) or _unheard(s) for s in staying]
+            if staying and all(done) and len(staying) + len(gone) == len(self.ids):
                 return lost
-            while coming and time.monotonic() - start >= coming[0].at_s:
+            while coming and self.clock() - start >= coming[0].at_s:
                 order_fault(self.operator.config, coming[0].vehicle_id, coming[0].fault)
                 coming.pop(0)
-            over = duration_s is not None and time.monotonic() - start >= duration_s
+            over = duration_s is not None and self.clock() - start >= duration_s
             if landing_since is None and (over or interrupted()):
-                landing_since = time.monotonic()
+                landing_since = self.clock()
                 self.operator.land()
-            if landing_since is not None and time.monotonic() - landing_since > LANDING_TIMEOUT_S:
+            if landing_since is not None and self.clock() - landing_since > LANDING_TIMEOUT_S:
                 return lost
-            time.sleep(POLL_S)
+            self.sleep(POLL_S)
+
+
+def _unheard(status: Mapping[str, Any]) -> bool:
+    """Whether a vehicle's autopilot has said nothing for so long that nobody need wait for it to land."""
+    age_s = status.get("autopilot_age_s")
+    return age_s is not None and age_s > UNHEARD_S

@@ -13,6 +13,7 @@ import numpy as np
 
 from companion.agent import Agent, Outputs
 from companion.config import FleetConfig
+from companion.core.events import Event
 from companion.core.failsafe import Failsafe
 from companion.core.frames import Ned
 from companion.core.values import Instant, Phase
@@ -66,6 +67,8 @@ class Lockstep:
     sent: list[Sent] = field(default_factory=list)
     notes: list[tuple[float, int, str]] = field(default_factory=list)
     """(seconds, vehicle, what happened)"""
+    events: list[tuple[int, int, Event]] = field(default_factory=list)
+    """(fleet time, vehicle, what happened)"""
     _truth: list[np.ndarray] = field(default_factory=list)
     _net: Network = field(init=False)
     _queue: list[tuple[int, int, Callable[[], None]]] = field(default_factory=list)
@@ -197,6 +200,7 @@ class Lockstep:
                     self._at(arrival, lambda j=j, p=payload, k=key: self._to_peer(j, k, p))  # type: ignore[misc]
         for event in out.events:
             self._log(i, "event", encode_event(event))
+            self.events.append((self.now.fleet_ns, i, event))
         self.notes += [(self.now_ns * 1e-9, i, note) for note in out.notes]
 
     def _to_peer(self, j: int, key: str, payload: bytes) -> None:

@@ -5,6 +5,7 @@ PX4 takes instance numbers: instance i has system id i + 1 and speaks to UDP 145
 HIL_STATE_QUATERNION on 19410 + i, the state of arming and mode from the ground station's link on 14550.
 """
 
+import json
 import os
 import re
 import select
@@ -14,7 +15,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from math import hypot, isfinite
 from pathlib import Path
@@ -44,6 +45,8 @@ STATE_MESSAGES = frozenset({0, 22, 30, 77, 245, CURRENT_MODE})
 """HEARTBEAT, PARAM_VALUE, ATTITUDE, COMMAND_ACK, EXTENDED_SYS_STATE and CURRENT_MODE"""
 TRUTH_MESSAGES = frozenset({115})
 """HIL_STATE_QUATERNION"""
+ENDED_FILE = "autopilots-ended.jsonl"
+"""in the flight's folder: a line [vehicle id, how] for each autopilot that has ended in flight"""
 MODE_RATE_HZ = 20.0
 SIH_QUADROTOR = 10040
 FLEET_PARAMETERS: Mapping[str, float | int] = {
@@ -173,6 +176,21 @@ os.execv(sys.argv[1], sys.argv[1:])
 Python in it may hang"""
 
 
+def tell_ended(folder: Path, vehicle_id: int, how: str) -> None:
+    """Leave word for the launcher that a vehicle's autopilot has ended."""
+    with suppress(OSError), (folder / ENDED_FILE).open("a", encoding="utf-8") as file:
+        file.write(json.dumps([vehicle_id, how]) + "\n")
+
+
+def read_ended(folder: Path) -> dict[int, str]:
+    """Vehicle -> how its autopilot has ended, as told so far."""
+    try:
+        lines = (folder / ENDED_FILE).read_text(encoding="utf-8").splitlines(keepends=True)
+    except OSError:
+        return {}
+    return dict(json.loads(line) for line in lines if line.endswith("\n"))
+
+
 class _Instance:
     """One vehicle's PX4 with its truth socket, and what it has said."""
 
@@ -281,6 +299,7 @@ class SitlHost:
             if not instance.missed and (status := instance.px4.process.poll()) is not None:
                 instance.missed = True
                 self.settings.log(f"vehicle {instance.vehicle.id}: PX4 ended with status {status}; see its px4.log")
+                tell_ended(self.settings.folder, instance.vehicle.id, f"PX4 ended with status {status}")
 
     def _serve(self, timeout_s: float, stop_fds: Sequence[int]) -> bool:
         sockets: list[Any] = [self._gcs, *(i.truth_socket for i in self.instances)]

@@ -134,10 +134,8 @@ def test_a_flight_without_faults_counts_next_to_nothing_as_rejected(ten: Recorde
 def test_the_summary_says_what_the_true_states_say(ten: Recorded) -> None:
     ls = ten.ls
     flight = Flight(ten.config, 3, ls.truth(), round(READY_S * 1e9) + UTC_AT_START_NS)
-    flight.motions = list(ls.vehicles[1].agent.programme.motions)
+    flight.events = ls.events
     flight.puts = [Put(s.time_ns + UTC_AT_START_NS, s.vehicle_id, s.topic, s.size) for s in ls.sent]
-    for s, i, text in ls.notes:
-        flight.note(round(s * 1e9) + UTC_AT_START_NS, i, text)
     summary = summarise(flight)
     assert summary["passed"], summary["criteria"]
     assert summary["minimum_distance_m"] == pytest.approx(distances(truth(ls, READY_S)).min(), abs=2e-4)

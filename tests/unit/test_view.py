@@ -1,0 +1,133 @@
+"""What people see of a flight, on terminals of any width and whatever vehicles say."""
+
+import io
+import itertools
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rich.console import Console
+
+from sim.view import show_summary, status_table
+
+LONG = "its clock is 0.341 s behind that of vehicle 3, " * 12
+REMARKS = st.text(max_size=300) | st.sampled_from([LONG, "[red]bold[/red]", "\x1b[2J\n\n\r\t", "飛行" * 60, ""])
+
+
+def status(**more: Any) -> dict[str, Any]:
+    said = {
+        "phase": "formed", "mode": "OFFBOARD", "armed": True, "killed": None, "ready": [], "failsafes": [],
+        "rejected": {}, "position_error_m": 0.1234, "neighbours": 4, "nearest_m": 3.99, "oldest_age_s": 7.5,
+        "lateness_ms": 1.25, "battery_percent": 93, "messages": 17,
+    }  # fmt: skip
+    return {**said, **more}
+
+
+def shown(vehicles: dict[int, dict[str, Any] | None], width: int, height: int | None = None) -> list[str]:
+    """The table's lines as a terminal of that width has them."""
+    console = Console(file=io.StringIO(), width=width, color_system=None)
+    console.print(status_table(vehicles, {1: 0.11}, width=width, height=height))
+    assert isinstance(console.file, io.StringIO)
+    lines = console.file.getvalue().splitlines()
+    assert all(Console(width=10_000).measure(line).maximum <= width for line in lines)
+    return lines
+
+
+WIDTHS = range(40, 201)
+
+
+@pytest.mark.parametrize("remark", ["", "x", "a word or two", LONG, "y" * 500])
+def test_every_vehicle_has_its_phase_and_error_on_a_line_at_any_width_and_with_any_remark(remark: str) -> None:
+    for width in WIDTHS:
+        lines = shown({1: status(failsafes=[remark]), 2: status(phase="moving"), 3: None}, width)
+        rows = {line.split()[0]: line.split()[1:] for line in lines[2:5]}
+        assert rows["1"][0] == "formed", (width, lines)
+        assert rows["2"][0] == "moving"
+        assert rows["3"][0] == "silent"
+        assert "0.12" in rows["1"]
+        assert "0.12" in rows["2"]
+
+
+def test_a_wider_terminal_shows_no_less_and_the_widest_shows_all() -> None:
+    columns = [len(shown({1: status()}, width)[2].split()) for width in WIDTHS]
+    assert all(a <= b for a, b in itertools.pairwise(columns))
+    assert columns[-1] == 10
+
+
+@pytest.mark.parametrize("width", [40, 76, 80, 100, 130, 200])
+def test_the_status_tells_every_word_of_a_remark_however_long(width: int) -> None:
+    words = [f"word{k}" for k in range(120)]
+    said = "".join("".join(shown({7: status(failsafes=[" ".join(words)])}, width)).split())
+    assert all(word in said for word in words)
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.dictionaries(st.integers(1, 250), REMARKS | st.none(), min_size=1, max_size=40),
+    st.integers(40, 200), st.integers(6, 60),
+)  # fmt: skip
+def test_a_live_table_never_has_more_lines_than_the_terminal(
+    remarks: dict[int, str | None], width: int, height: int
+) -> None:
+    vehicles = {i: None if remark is None else status(failsafes=[remark]) for i, remark in remarks.items()}
+    lines = shown(vehicles, width, height)
+    assert len(lines) <= height
+    told = [int(word) for line in lines if (word := line.split()[0] if line.split() else "").isdigit()]
+    assert len([i for i in told if i in vehicles]) >= min(len(vehicles), height - 3)
+
+
+ODD = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=9),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
+)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.dictionaries(st.sampled_from(sorted(status())), ODD), st.integers(40, 200))
+def test_whatever_a_vehicle_says_of_itself_the_others_are_shown(odd: dict[str, Any], width: int) -> None:
+    lines = shown({1: odd, 2: status(), 3: {**status(), **odd}}, width)
+    assert any(line.split()[:2] == ["2", "formed"] for line in lines)
+
+
+def test_a_killed_vehicle_is_shown_as_killed_whatever_its_phase_and_before_all_others() -> None:
+    vehicles: dict[int, dict[str, Any] | None] = {i: status() for i in range(1, 10)}
+    vehicles[9] = status(phase="landed", armed=False, killed="its motors stopped in the air")
+    row = shown(vehicles, 160)[-1]
+    assert row.split()[:2] == ["9", "killed"]
+    assert "its motors stopped in the air" in row
+    crowded = shown(vehicles, 100, 5)
+    assert any(line.split()[:2] == ["9", "killed"] for line in crowded)
+    assert "and 7 more" in crowded[-1]
+
+
+def test_the_summary_shows_who_commanded_what_and_who_was_killed(capsys: pytest.CaptureFixture[str]) -> None:
+    none = {"p50": None, "p99": None}
+    steady = dict.fromkeys(
+        (
+            "formation_error_rms_m", "seconds", "velocity_error_rms_m_s", "centroid_error_rms_m",
+            "messages_per_vehicle_hz", "reduction_vs_20hz_percent", "payload_bytes_per_vehicle_s",
+            "wire_bytes_per_vehicle_s",
+        ),
+        1.0,
+    )  # fmt: skip
+    show_summary(
+        {
+            "vehicles": 3, "formed_after_s": 20.0, "minimum_distance_m": 3.0, "steady": steady, "latency_ms": none,
+            "loop_lateness_ms": none, "reference_lateness_ms": none, "cpu_per_tick_ms": None,
+            "setpoint_gap_max_s": 0.1, "touchdown_max_m_s": 12.6, "killed": {3: "killed by command"}, "failsafes": [],
+            "lost": [], "autopilots_lost": {2: "PX4 ended with status -9"}, "rejected": {}, "passed": False,
+            "commands": [
+                {
+                    "at_s": 31.4, "verb": "kill", "issuer": "operator-ab12", "revision": 3, "accepted": [3],
+                    "refused": {"1": "[why] not"}, "unanswered": [2],
+                }
+            ],
+            "criteria": [{"what": "vehicles killed", "limit": "<= 0", "value": 1, "met": False}],
+        }
+    )  # fmt: skip
+    said = " ".join(capsys.readouterr().out.split())
+    assert "31.4 s kill by operator-ab12: accepted by 1; vehicle 1 refused: [why] not; no answer: vehicle 2" in said
+    assert "vehicle 3: killed by command" in said
+    assert "vehicle 2: PX4 ended with status -9" in said
+    assert said.endswith("not met: vehicles killed <= 0, got 1 not passed")
