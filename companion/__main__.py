@@ -90,7 +90,7 @@ def replay(
 ) -> None:
     """Run the agent on a recording's inputs and compare its outputs byte for byte.
 
-    Exit status: 0 the same, 1 different (the first difference is shown), 2 not a recording.
+    Exit status: 0 the same, 1 different, or entries are missing (the first is shown), 2 no recording, or a damaged one.
     """
     from companion.replay import replay_file
 

@@ -2,7 +2,7 @@
 
 import tomllib
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from companion.agent import Agent
@@ -10,10 +10,11 @@ from companion.config import parse
 from companion.core.failsafe import Failsafe
 from companion.core.values import Instant
 from companion.errors import CompanionError
-from companion.io.recorder import Entry, read_recording
+from companion.io.recorder import Entry, Gap, Recording, RecordingError, gap_between, read_recording
 
 ANSWER = "output/answer"
 OUTPUTS = ("output/mavlink", "output/peer", ANSWER)
+BOOT_IDS = range(1 << 32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,43 +27,61 @@ class ReplayResult:
     """the first one, or None"""
     ticks: int = 0
     """control ticks among the inputs, as the recording counts them"""
+    gap: Gap | None = None
+    """where the recording has lost entries: nothing behind it can be compared"""
 
     @property
     def same(self) -> bool:
-        """Whether every output was the recorded one."""
-        return self.difference is None
+        """Whether every output was the recorded one, and none is missing."""
+        return self.difference is None and self.gap is None
 
     def sentence(self) -> str:
         """For people."""
         head = f"{self.inputs} inputs, {self.outputs} outputs compared byte for byte"
+        if self.gap is not None:
+            return f"{head}: the same; {self.gap.sentence()}, so nothing behind them can be compared"
         return f"{head}: the same" if self.same else f"{head}: first difference: {self.difference}"
 
 
 def replay_file(path: Path) -> ReplayResult:
-    """Replay one recording; CompanionError if the file is none."""
+    """Replay one recording; RecordingError if the file is none, or is damaged."""
+    recording = read_recording(path)
+    recording.verify()
+    agent = _agent(recording)
+    result = replay(agent, recording.entries, recording.complete)
+    if result.same and (behind := list(recording.gaps())):
+        return replace(result, gap=behind[-1])
+    return result
+
+
+def _agent(recording: Recording) -> Agent:
+    """An agent made from what the recorded one was made from."""
+    facts, path = recording.metadata, recording.path
     try:
-        recording = read_recording(path)
-    except OSError as error:
-        raise CompanionError(f"{path}: cannot be read: {error.strerror}") from error
-    try:
-        facts = recording.metadata
         config = parse(tomllib.loads(facts["config"]), path.name)
-        agent = Agent(config, int(facts["vehicle_id"]), int(facts["boot_id"]))
+        vehicle_id, boot_id = int(facts["vehicle_id"]), int(facts["boot_id"])
+        if boot_id not in BOOT_IDS:
+            raise ValueError(f"boot id {boot_id}")
+        return Agent(config, vehicle_id, boot_id)
     except KeyError as missing:
-        raise CompanionError(f"{path}: is no companion's recording: {missing} is missing") from None
-    except ValueError as error:
-        raise CompanionError(f"{path}: is no companion's recording: {error}") from None
-    return replay(agent, recording.entries, recording.complete)
+        raise RecordingError(path, f"is no companion's recording: {missing} is missing") from None
+    except (ValueError, RecursionError, CompanionError) as error:
+        raise RecordingError(path, f"is no companion's recording: {error}") from None
 
 
 def replay(agent: Agent, entries: Iterable[Entry], complete: bool = True) -> ReplayResult:
-    """Feed an agent recorded inputs; stops at the first output that differs.
+    """Feed an agent recorded inputs; stops at the first output that differs, and where entries were lost.
 
     Of a recording that is not complete (its process was killed) the last outputs may be missing.
     """
     expected: list[tuple[str, bytes]] = []
     inputs = outputs = ticks = 0
+    before: Entry | None = None
     for entry in entries:
+        gap = gap_between(before, entry)
+        if gap is not None:
+            return ReplayResult(inputs, outputs, None, ticks, gap)
+        before = entry
         if expected and expected[0][0] == ANSWER != entry.channel:
             expected.pop(0)  # recordings need not hold the answers
         if entry.channel in OUTPUTS:
@@ -83,7 +102,13 @@ def replay(agent: Agent, entries: Iterable[Entry], complete: bool = True) -> Rep
             channel, body = expected[0]
             return ReplayResult(inputs, outputs, f"{_at(entry)}: replayed {channel} {body.hex()}, recorded nothing")
         inputs += 1
-        expected = list(INPUTS[entry.channel](agent, entry.body, entry.instant))
+        try:
+            expected = list(INPUTS[entry.channel](agent, entry.body, entry.instant))
+        except Exception as error:  # noqa: BLE001 - the recorded agent went on, so that this one does not is a difference
+            said = f"{type(error).__name__}: {error}"
+            return ReplayResult(
+                inputs, outputs, f"{_at(entry)}: recorded {entry.channel}, on which replay raises {said}"
+            )
     expected = [e for e in expected if e[0] != ANSWER]
     if expected and complete:
         channel, body = expected[0]

@@ -20,7 +20,6 @@ import tomli_w
 from companion.config import FleetConfig, parse
 from companion.errors import CompanionError, RefusedError
 from companion.io.loop import network_settings
-from companion.io.recorder import read_recording
 from companion.io.zenoh_peers import OperatorLink
 from companion.operate import Answers, Operator, PreflightError
 from sim.faults import ScheduledFault, order_fault
@@ -230,7 +229,7 @@ def _fly(
         versions={"python": sys.version.split()[0], **{name: version(name) for name in LIBRARIES}},
     )
     for i in ids:
-        flight.read(i, read_recording(folder / f"vehicle-{i}.mcap").entries)
+        flight.read_file(i, folder / f"vehicle-{i}.mcap")
         said = final.get(i)
         flight.rejected += Counter(said["rejected"] if said else {})
     rows = read_reference_loop(folder / "reference.bin")

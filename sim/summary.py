@@ -5,9 +5,11 @@ what they believed stands beside it, and is judged where nobody knows the truth 
 """
 
 import json
+import struct
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,8 +21,9 @@ from companion.core.events import Event, FailsafeActed, Killed, MotionAdopted, P
 from companion.core.monitor import algebraic_connectivity, centroid_error_m, formation_error_m, velocity_error_m_s
 from companion.core.plan import Motion, Programme
 from companion.core.values import FLYING_PHASES, Phase
+from companion.errors import WireError
 from companion.io.loop import TICK_RECORD, TRAFFIC_RECORD
-from companion.io.recorder import Entry
+from companion.io.recorder import Entry, RecordingError, read_recording
 from companion.orders import Order, read_order
 from companion.wire.events import decode_event
 from companion.wire.mavlink import Px4Mode
@@ -41,6 +44,7 @@ at this"""
 SETPOINT_GAP_MAX_S = 0.5
 """half of the COM_OF_LOSS_T of 1.0 s after which the autopilot's failsafe acts"""
 COMMANDS_TOLD_MOST = 1000
+GAPS_TOLD_MOST = 5
 LEFT_FORMATION = frozenset({Phase.IDLE, Phase.RETURNING, Phase.LANDING, Phase.LANDED, Phase.RELEASED})
 """phases with which the steady part ends"""
 REFERENCE_HZ = 20.0
@@ -103,13 +107,40 @@ class Flight:
     """vehicle -> how its autopilot ended in flight"""
     reference_lateness_ns: Array | None = None
     versions: Mapping[str, str] = field(default_factory=dict)
+    unrecorded: dict[int, str] = field(default_factory=dict)
+    """vehicle -> what its recording lacks"""
+
+    def read_file(self, vehicle_id: int, path: Path) -> None:
+        """Take one companion's recording as far as it is there; what it lacks is told in the summary."""
+        try:
+            recording = read_recording(path)
+            self.read(vehicle_id, recording.entries)
+            gaps = list(recording.gaps())
+        except RecordingError as error:
+            self.unrecorded[vehicle_id] = str(error)
+        else:
+            if gaps:
+                self.unrecorded[vehicle_id] = "; ".join(gap.sentence() for gap in gaps[:GAPS_TOLD_MOST])
 
     def read(self, vehicle_id: int, entries: Iterable[Entry]) -> None:
-        """Take one companion's recording."""
-        ticks, traffic = [], []
+        """Take one companion's recording; RecordingError for an entry that cannot be read, all before it is taken."""
+        ticks: list[tuple[float, ...]] = []
+        traffic: list[tuple[float, ...]] = []
         asked: Command | None = None
-        for entry in entries:
-            now = entry.instant.fleet_ns
+        try:
+            for entry in entries:
+                asked = self._read(vehicle_id, entry, asked, ticks, traffic)
+        finally:
+            self.ticks[vehicle_id] = np.array(ticks, dtype=float).reshape(-1, 13)
+            self.traffic[vehicle_id] = np.array(traffic, dtype=float).reshape(-1, 2)
+
+    def _read(
+        self, vehicle_id: int, entry: Entry, asked: Command | None, ticks: list[tuple[float, ...]],
+        traffic: list[tuple[float, ...]],
+    ) -> Command | None:  # fmt: skip
+        """Take one entry; returns the command whose answer comes next."""
+        now = entry.instant.fleet_ns
+        try:
             match entry.channel:
                 case "tick":
                     ticks.append((now, *TICK_RECORD.unpack(entry.body)))
@@ -121,13 +152,13 @@ class Flight:
                     topic, _, payload = entry.body.partition(b"\0")
                     self.puts.append(Put(now, vehicle_id, topic.decode(), len(payload)))
                 case "input/command":
-                    asked = self._command(now, vehicle_id, entry.body)
-                case "output/answer":
-                    if asked is not None:
-                        _answer(asked, vehicle_id, entry.body)
-                    asked = None
-        self.ticks[vehicle_id] = np.array(ticks, dtype=float).reshape(-1, 13)
-        self.traffic[vehicle_id] = np.array(traffic, dtype=float).reshape(-1, 2)
+                    return self._command(now, vehicle_id, entry.body)
+                case "output/answer" if asked is not None:
+                    _answer(asked, vehicle_id, entry.body)
+        except (struct.error, ValueError, KeyError, TypeError, WireError) as error:
+            where = f"vehicle {vehicle_id}'s recording"
+            raise RecordingError(where, f"entry {entry.sequence} ({entry.channel}) cannot be read: {error}") from None
+        return None
 
     def _command(self, time_ns: int, vehicle_id: int, payload: bytes) -> Command | None:
         order = read_order(payload)
@@ -261,6 +292,7 @@ def summarise(flight: Flight) -> dict[str, Any]:
         "landed": ended,
         "touchdown_max_m_s": _round(truth.touchdown_m_s),
         "killed": {i: e.cause.value for _, i, e in flight.events if isinstance(e, Killed)},
+        "unrecorded": dict(flight.unrecorded),
         "lost": sorted(flight.lost),
         "autopilots_lost": dict(flight.autopilots_lost),
         "failsafes": [f"vehicle {i}: {e.sentence}" for _, i, e in flight.events if isinstance(e, FailsafeActed)],
@@ -540,6 +572,7 @@ def _criteria(summary: Mapping[str, Any], config: FleetConfig, centroid_limit_m:
         ("vehicles killed", len(summary["killed"]), "<=", 0),
         ("autopilots lost", len(summary["autopilots_lost"]), "<=", 0),
         ("vehicles not landed and disarmed", sum(not x for x in summary["landed"].values()), "<=", 0),
+        ("recordings not whole", len(summary["unrecorded"]), "<=", 0),
         ("companions lost", len(summary["lost"]), "<=", 0),
     ]
     return [

@@ -267,6 +267,7 @@ def show_summary(summary: Mapping[str, Any]) -> None:
         ("fastest touchdown", _unit(summary["touchdown_max_m_s"], "m/s")),
         ("killed", _of_vehicles(summary["killed"])),
         ("failsafes", "; ".join(summary["failsafes"]) or "none"),
+        ("not recorded", _of_vehicles(summary["unrecorded"])),
         ("lost companions", ", ".join(str(i) for i in summary["lost"]) or "none"),
         ("lost autopilots", _of_vehicles(summary["autopilots_lost"])),
         *(("commands" if k == 0 else "", _command(c)) for k, c in enumerate(summary["commands"])),

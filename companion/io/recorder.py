@@ -27,22 +27,24 @@ import os
 import struct
 import threading
 import time
+import zlib
 from collections import Counter, deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Final, Self
+from typing import IO, Final, Self, TypeVar
 
 from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, DataEnd, Footer, Header, Metadata, MetadataIndex, Statistics
 
 from companion.core.values import Instant
 from companion.errors import CompanionError
 
-__all__ = ["Entry", "Recorder", "Recording", "RecordingError", "read_recording"]
+__all__ = ["Entry", "Gap", "Recorder", "Recording", "RecordingError", "gap_between", "read_recording"]
 
 QUEUE_CAPACITY: Final = 32_768
 """entries waiting for the disk: about a minute's worth"""
@@ -64,18 +66,24 @@ _MESSAGE_OPCODE: Final = int(Opcode.MESSAGE)
 _RECORD_MAX_BYTES: Final = 1 << 28
 _SEQUENCE_MASK: Final = 0xFFFF_FFFF
 
+_AMONG_ENTRIES: Final = frozenset({Opcode.HEADER, Opcode.METADATA, Opcode.SCHEMA, Opcode.ATTACHMENT})
+_Record = TypeVar("_Record")
 _Pending = tuple[int, str, Instant, bytes]
 
 
 class RecordingError(CompanionError):
-    """A file that is not a recording."""
+    """A file that is no recording, or a damaged one: says which, where in it, and why."""
+
+    def __init__(self, path: Path | str, why: str, offset: int | None = None) -> None:
+        super().__init__(f"{path}: {why}" if offset is None else f"{path}: at byte {offset}: {why}")
 
 
 class Recorder:
     """Writes one flight to one new file.
 
-    The constructor raises OSError when the file exists or cannot be written. After that nothing raises: a full disk
-    shows in `failure` and `lost`, and recording goes on when there is room again.
+    `write` puts bytes at a place of a file, as os.pwrite does. The constructor raises OSError when the file exists or
+    cannot be written. After that nothing raises: a full disk shows in `failure` and `lost`, and recording goes on when
+    there is room again.
     """
 
     def __init__(
@@ -85,7 +93,9 @@ class Recorder:
         *,
         queue_capacity: int = QUEUE_CAPACITY,
         synchronise_interval_s: float = SYNCHRONISE_INTERVAL_S,
+        write: Callable[[int, memoryview, int], int] = os.pwrite,
     ) -> None:
+        self._pwrite = write
         self._queue: deque[_Pending] = deque()
         self._capacity = queue_capacity
         self._synchronise_interval_s = synchronise_interval_s
@@ -99,6 +109,8 @@ class Recorder:
         self._statistics = Statistics(0, 0, {}, 0, 0, 0, 0, 0, 0)
         self._metadata_indexes: list[MetadataIndex] = []
         self._size = 0
+        self._checksum = 0
+        """CRC-32 of what is written"""
         self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
         try:
             builder = RecordBuilder()
@@ -211,12 +223,13 @@ class Recorder:
         written = 0
         try:
             while written < len(view):
-                written += os.pwrite(self._fd, view[written:], self._size + written)
+                written += self._pwrite(self._fd, view[written:], self._size + written)
         except OSError:
             with contextlib.suppress(OSError):
                 os.ftruncate(self._fd, self._size)
             raise
         self._size += written
+        self._checksum = zlib.crc32(data, self._checksum)
 
     def _synchronise(self) -> None:
         try:
@@ -238,8 +251,11 @@ class Recorder:
         builder = RecordBuilder()
         if self.lost:
             self._add_metadata(builder, _LOSS, {"entries": str(self.lost)})
-        DataEnd(0).write(builder)
-        summary_start = self._size + builder.count
+        head = builder.end()
+        builder = RecordBuilder()
+        # 0 stands for none.
+        DataEnd(zlib.crc32(head, self._checksum)).write(builder)
+        summary_start = self._size + len(head) + builder.count
         for name, channel in self._channels.items():
             builder.write(_channel_record(channel, name))
         self._statistics.channel_count = len(self._channels)
@@ -250,7 +266,7 @@ class Recorder:
         Footer(summary_start, 0, 0).write(builder)
         builder.write(_MAGIC)
         try:
-            self._write(builder.end())
+            self._write(head + builder.end())
         except OSError as error:
             self._fail(error)
 
@@ -269,15 +285,47 @@ class Entry:
     channel: str
     instant: Instant
     body: bytes
-    sequence: int = 0
-    """number of the call modulo 2^32"""
+    sequence: int | None = None
+    """number of the call modulo 2^32, where it is known: a gap is a loss"""
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """Entries that a recording has lost between two that it has, or behind the last one."""
+
+    entries: int
+    after: Instant | None
+    """time of the last entry before them; None: they were the first"""
+
+    def sentence(self) -> str:
+        """For people."""
+        what = f"{self.entries} {'entry is' if self.entries == 1 else 'entries are'} missing"
+        return f"{what} {'at the beginning' if self.after is None else f'after monotonic {_seconds(self.after)} s'}"
+
+
+def gap_between(before: Entry | None, after: Entry) -> Gap | None:
+    """What was lost between two entries that follow each other (None: the beginning)."""
+    if after.sequence is None or (before is not None and before.sequence is None):
+        return None
+    expected = 0 if before is None or before.sequence is None else before.sequence + 1
+    lost = (after.sequence - expected) & _SEQUENCE_MASK
+    return Gap(lost, None if before is None else before.instant) if lost else None
+
+
+def _seconds(now: Instant) -> str:
+    return f"{now.monotonic_ns * 1e-9:.6f}"
 
 
 class Recording:
-    """A recording on disk, whole or cut short by a killed process."""
+    """A recording on disk, whole or cut short by a killed process.
+
+    Whatever reads from it raises RecordingError, and nothing else, where the file is damaged or cannot be read.
+    """
 
     def __init__(self, path: Path) -> None:
-        self._path = path
+        self.path = path
+        self.complete = self._is_complete()
+        """whether the recorder was closed; False after a kill"""
         self.metadata: Mapping[str, str] = self._read_metadata()
         """what the recorder was given"""
 
@@ -286,66 +334,124 @@ class Recording:
         """All entries in the order of the calls, from the beginning each time."""
         names: dict[int, str] = {}
         unpack, begin = _MESSAGE_FIELDS.unpack_from, _MESSAGE_FIELDS.size
-        with self._path.open("rb") as file:
-            for opcode, content in _records(file):
-                if opcode == _MESSAGE_OPCODE:
-                    channel, sequence, fleet_ns, monotonic_ns = unpack(content)
-                    yield Entry(names[channel], Instant(monotonic_ns, fleet_ns), content[begin:], sequence)
-                elif opcode == Opcode.CHANNEL:
-                    record = Channel.read(ReadDataStream(BytesIO(content)))
-                    names[record.id] = record.topic
-                elif opcode == Opcode.CHUNK:
-                    raise RecordingError(f"{self._path}: has chunks, so another tool has rewritten it")
-                elif opcode == Opcode.DATA_END:
+        for offset, opcode, content in self._records():
+            if opcode == _MESSAGE_OPCODE:
+                if len(content) < begin:
+                    raise RecordingError(self.path, "a message without its head", offset)
+                channel, sequence, fleet_ns, monotonic_ns = unpack(content)
+                if channel not in names:
+                    raise RecordingError(self.path, f"a message on channel {channel}, which is not declared", offset)
+                yield Entry(names[channel], Instant(monotonic_ns, fleet_ns), content[begin:], sequence)
+            elif opcode == Opcode.CHANNEL:
+                record = self._parsed(Channel, content, offset)
+                names[record.id] = record.topic
+            elif opcode == Opcode.CHUNK:
+                raise RecordingError(self.path, "has chunks, so another tool has rewritten it", offset)
+            elif opcode == Opcode.DATA_END:
+                return
+            elif opcode not in _AMONG_ENTRIES:
+                raise RecordingError(self.path, f"a record of kind {opcode:#x} among the entries", offset)
+
+    def verify(self) -> None:
+        """Read the whole file, and compare its checksum where it has one (a killed process leaves none)."""
+        for _ in self.entries:
+            pass
+        with self._opened() as file:
+            for offset, opcode, content in self._records():
+                if opcode == Opcode.DATA_END:
+                    wanted = self._parsed(DataEnd, content, offset).data_section_crc
+                    file.seek(0)
+                    if wanted != 0 and zlib.crc32(file.read(offset)) != wanted:
+                        raise RecordingError(self.path, "is damaged: its content is not that of its checksum")
                     return
+        if self.complete:
+            raise RecordingError(self.path, "is damaged: its end is there, and the end of its entries is not")
+
+    def gaps(self) -> Iterator[Gap]:
+        """What was lost, as far as the entries that are there and the recorder's own count tell; reads the file."""
+        before: Entry | None = None
+        lost = 0
+        for entry in self.entries:
+            gap = gap_between(before, entry)
+            if gap is not None:
+                lost += gap.entries
+                yield gap
+            before = entry
+        if (behind := self._lost_entries() - lost) > 0:
+            yield Gap(behind, None if before is None else before.instant)
 
     def missing(self) -> int:
-        """How many entries were lost between the first and the last that are there; reads the file."""
-        missing = 0
-        expected = 0
-        for entry in self.entries:
-            missing += (entry.sequence - expected) & _SEQUENCE_MASK
-            expected = entry.sequence + 1
-        return missing
+        """How many entries were lost; reads the file."""
+        return sum(gap.entries for gap in self.gaps())
 
-    @property
-    def complete(self) -> bool:
-        """Whether the recorder was closed; False after a kill."""
-        with self._path.open("rb") as file:
-            file.seek(0, os.SEEK_END)
-            if file.tell() < 2 * len(_MAGIC):
+    def _lost_entries(self) -> int:
+        """What the recorder has counted, 0 where it could not tell."""
+        for offset, opcode, content in self._records():
+            if opcode == Opcode.METADATA:
+                record = self._parsed(Metadata, content, offset)
+                if record.name == _LOSS:
+                    told = record.metadata.get("entries", "")
+                    if not (told.isascii() and told.isdigit() and len(told) < 20):
+                        raise RecordingError(self.path, f"a loss of {told!r:.40} entries", offset)
+                    return int(told)
+        return 0
+
+    def _is_complete(self) -> bool:
+        with self._opened() as file:
+            if file.seek(0, os.SEEK_END) < 2 * len(_MAGIC):
                 return False
             file.seek(-len(_MAGIC), os.SEEK_END)
             return file.read() == _MAGIC
 
     def _read_metadata(self) -> Mapping[str, str]:
-        with self._path.open("rb") as file:
+        for offset, opcode, content in self._records():
+            if opcode == Opcode.METADATA:
+                record = self._parsed(Metadata, content, offset)
+                if record.name == _METADATA:
+                    return dict(record.metadata)
+            elif opcode != Opcode.HEADER:
+                break
+        raise RecordingError(self.path, "is no recording of a companion: its metadata are missing")
+
+    @contextlib.contextmanager
+    def _opened(self) -> Iterator[IO[bytes]]:
+        try:
+            with self.path.open("rb") as file:
+                yield file
+        except OSError as error:
+            raise RecordingError(self.path, f"cannot be read: {error.strerror}") from error
+
+    def _records(self) -> Iterator[tuple[int, int, bytes]]:
+        """Place, opcode and content of each whole record up to the summary; a torn one ends the reading, unless the
+        file's own end stands behind it."""
+        with self._opened() as file:
             if file.read(len(_MAGIC)) != _MAGIC:
-                raise RecordingError(f"{self._path}: is no MCAP file")
-            for opcode, content in _records(file):
-                if opcode == Opcode.METADATA:
-                    record = Metadata.read(ReadDataStream(BytesIO(content)))
-                    if record.name == _METADATA:
-                        return dict(record.metadata)
-                elif opcode != Opcode.HEADER:
+                raise RecordingError(self.path, "is no MCAP file")
+            while True:
+                offset = file.tell()
+                head = file.read(_RECORD_HEAD.size)
+                if len(head) < _RECORD_HEAD.size:
                     break
-        raise RecordingError(f"{self._path}: is no recording of a companion: its metadata are missing")
+                opcode, length = _RECORD_HEAD.unpack(head)
+                if length > _RECORD_MAX_BYTES:
+                    raise RecordingError(self.path, f"a record of {length} bytes", offset)
+                content = file.read(length)
+                if len(content) < length:
+                    break
+                yield offset, opcode, content
+                if opcode == Opcode.DATA_END:
+                    return
+            if self.complete:
+                raise RecordingError(self.path, f"a record reaches beyond the file's end ({file.tell()})", offset)
+
+    def _parsed(self, kind: type[_Record], content: bytes, offset: int) -> _Record:
+        try:
+            record: _Record = kind.read(ReadDataStream(BytesIO(content)))  # type: ignore[attr-defined]
+        except (ValueError, struct.error, EndOfFile, McapError, MemoryError, OverflowError) as error:
+            raise RecordingError(self.path, f"a {kind.__name__.lower()} that cannot be read: {error}", offset) from None
+        return record
 
 
 def read_recording(path: Path) -> Recording:
-    """Open a recording.
-
-    Raises RecordingError when the file is something else, OSError when it cannot be read.
-    """
+    """Open a recording; RecordingError when the file is something else, or cannot be read."""
     return Recording(path)
-
-
-def _records(file: IO[bytes]) -> Iterator[tuple[int, bytes]]:
-    """Opcode and content of each whole record; a torn one ends the reading."""
-    file.seek(len(_MAGIC))
-    while len(head := file.read(_RECORD_HEAD.size)) == _RECORD_HEAD.size:
-        opcode, length = _RECORD_HEAD.unpack(head)
-        content = file.read(min(length, _RECORD_MAX_BYTES))
-        if len(content) < length:
-            return
-        yield opcode, content

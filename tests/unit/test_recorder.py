@@ -44,6 +44,7 @@ def test_what_was_recorded_is_read_in_the_order_of_the_calls_though_times_are_eq
     assert recording.metadata == METADATA
     assert recording.complete
     assert recording.missing() == 0
+    recording.verify()
 
 
 INT64 = st.integers(-(1 << 63), (1 << 63) - 1)
@@ -167,8 +168,10 @@ assert recorder.lost == 50
     subprocess.run([sys.executable, "-c", code, str(tmp_path / "a.mcap")], check=True, timeout=40)
     recording = read_recording(tmp_path / "a.mcap")
     assert [entry.sequence for entry in recording.entries] == list(range(50, 60))
+    assert [gap.sentence() for gap in recording.gaps()] == ["50 entries are missing at the beginning"]
     assert recording.missing() == 50
     assert recording.complete
+    recording.verify()
     with (tmp_path / "a.mcap").open("rb") as file:
         assert {record.name: record.metadata for record in make_reader(file).iter_metadata()}["loss"] == {
             "entries": "50"
@@ -182,6 +185,7 @@ def test_a_full_queue_refuses_and_counts_and_the_file_shows_the_gap(tmp_path: Pa
         assert recorder.lost == 990
     recording = read_recording(tmp_path / "a.mcap")
     assert [entry.body for entry in recording.entries] == [b"%d" % n for n in range(10)]
+    assert [gap.sentence() for gap in recording.gaps()] == ["990 entries are missing after monotonic 5.000000 s"]
 
 
 def test_entries_after_closing_are_counted_as_lost_and_closing_again_does_nothing(tmp_path: Path) -> None:
@@ -212,6 +216,27 @@ def test_a_file_that_is_no_recording_is_refused_with_its_name(tmp_path: Path, co
     (tmp_path / "other").write_bytes(content)
     with pytest.raises(RecordingError, match="other"):
         read_recording(tmp_path / "other")
+
+
+def test_every_bit_of_the_entries_is_under_the_checksum(tmp_path: Path) -> None:
+    write(tmp_path / "a.mcap", numbered(12))
+    whole = (tmp_path / "a.mcap").read_bytes()
+    entries = range(whole.index(b"seed") + 8, whole.rindex(b"11") + 2)
+    path = tmp_path / "b.mcap"
+    for at in entries:
+        damaged = bytearray(whole)
+        damaged[at] ^= 1 << at % 8
+        path.write_bytes(damaged)
+        with pytest.raises(RecordingError, match=r"b\.mcap: "):
+            read_recording(path).verify()
+    assert len(entries) > 300
+
+
+def test_a_file_that_cannot_be_read_is_a_recording_error_with_the_reason(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"nowhere\.mcap: cannot be read: No such file"):
+        read_recording(tmp_path / "nowhere.mcap")
+    with pytest.raises(RecordingError, match="cannot be read: Is a directory"):
+        read_recording(tmp_path)
 
 
 def test_a_recording_rewritten_in_chunks_is_refused_and_not_taken_for_empty(tmp_path: Path) -> None:

@@ -116,7 +116,8 @@ def test_the_summary_shows_who_commanded_what_and_who_was_killed(capsys: pytest.
             "vehicles": 3, "formed_after_s": 20.0, "minimum_distance_m": 3.0, "steady": steady, "latency_ms": none,
             "loop_lateness_ms": none, "reference_lateness_ms": none, "cpu_per_tick_ms": None,
             "setpoint_gap_max_s": 0.1, "touchdown_max_m_s": 12.6, "killed": {3: "killed by command"}, "failsafes": [],
-            "lost": [], "autopilots_lost": {2: "PX4 ended with status -9"}, "rejected": {}, "passed": False,
+            "lost": [], "unrecorded": {}, "autopilots_lost": {2: "PX4 ended with status -9"}, "rejected": {},
+            "passed": False,
             "commands": [
                 {
                     "at_s": 31.4, "verb": "kill", "issuer": "operator-ab12", "revision": 3, "accepted": [3],
