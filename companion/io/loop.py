@@ -41,6 +41,8 @@ far, position error m, nearest neighbour m, whether a setpoint was sent, own pos
 (fleet frame, NED)"""
 TRAFFIC_RECORD = struct.Struct("<q")
 """body of the "traffic" channel: bytes that this process's TCP connections have sent so far"""
+STATUS_LASTS_NS = 50_000_000
+"""a status this old is told again: making one takes a good part of a control period; a command makes it anew"""
 LANDING_GRACE_S = 3.0
 """how long an ending companion waits for its autopilot to confirm landing"""
 ABANDONED_GRACE_S = 1.0
@@ -134,6 +136,8 @@ class Companion:
         self._driver_ns: int | None = None
         """when the position that the next tick follows from was received"""
         self.lateness_ns = 0
+        self._status: bytes | None = None
+        self._status_ns = 0
 
     def _wake(self) -> None:
         with suppress(OSError):  # full: the loop wakes anyway; closed: it has ended
@@ -196,7 +200,7 @@ class Companion:
                     waiting.remove(stop_fd)
                     self.stop(ABANDONED_GRACE_S)
                 self._advance(deadline_ns)
-                for request in requests:
+                for request in sorted(requests, key=lambda r: r.kind != "command"):
                     self._reply(request)
                 now_ns = time.monotonic_ns()
                 if now_ns >= self._second_ns:
@@ -281,11 +285,17 @@ class Companion:
             self._record("input/command", now, request.payload)
             answer = self.agent.receive_command(request.payload, now)
             self._record("output/answer", now, answer)
+            self._status = None
             request.reply(answer)
             return
         if request.kind == "preflight":
             request.reply(self._preflight(request, now))
             return
+        if self._status is None or now.monotonic_ns - self._status_ns > STATUS_LASTS_NS:
+            self._status, self._status_ns = self._make_status(now), now.monotonic_ns
+        request.reply(self._status)
+
+    def _make_status(self, now: Instant) -> bytes:
         status = self.agent.status(now)
         counters = self.network.counters
         status["lateness_ms"] = self.lateness_ns * 1e-6
@@ -298,7 +308,7 @@ class Companion:
             "peer: under our own id": counters.own_id_heard,
         }
         status["rejected"] |= {kind: count for kind, count in elsewhere.items() if count}
-        request.reply(json.dumps(status).encode())
+        return json.dumps(status).encode()
 
     def _preflight(self, request: Request, now: Instant) -> bytes:
         if request.payload == b"clock":

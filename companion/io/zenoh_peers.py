@@ -26,7 +26,6 @@ import re
 import threading
 import time
 import zlib
-from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from queue import Empty, SimpleQueue
@@ -38,6 +37,7 @@ import zenoh.ext
 from zenoh.handlers import Callback
 
 from companion.errors import CompanionError, ConfigError
+from companion.io.mailbox import BOUNDS, Mailbox
 
 __all__ = [
     "Event",
@@ -61,10 +61,18 @@ TOPICS: Final = (STATE_TOPIC, PLAN_TOPIC)
 """what vehicles publish and hear from each other"""
 REQUEST_KINDS: Final = ("command", "status", "preflight")
 
-QUEUE_CAPACITY: Final = 4096
-"""events waiting for the loop: at 20 peers and 50 Hz each, four seconds"""
 PAYLOAD_MAX_BYTES: Final = 65_536
 """larger payloads are counted as malformed and not delivered"""
+STATE_MAX_BYTES: Final = 16_384
+"""above the largest state with a digest of 255 entries"""
+QUESTION_MAX_BYTES: Final = 1024
+"""of a question that is no command"""
+PUTS_HZ: Final = {STATE_TOPIC: 100.0, PLAN_TOPIC: 20.0}
+"""how often a session hears each topic from one other session at most; the rest is left out before Python sees it"""
+REQUESTS_HZ: Final = 50.0
+"""the same for each kind of question"""
+ASK_INTERVAL_S: Final = 0.03
+"""an operator asks the same kind of question no more often, so that none of its own is left out"""
 MESSAGE_MAX_BYTES: Final = 1 << 20
 """what a session reassembles from fragments at most"""
 
@@ -149,7 +157,42 @@ def zenoh_configuration(settings: PeerNetworkSettings) -> zenoh.Config:
     # An express message fills a whole batch, and of the default's two batches a link the third message within a
     # millisecond is dropped when the machine is busy. Smaller batches keep the memory of thirty links small.
     link["tx"] |= {"batch_size": 8192, "queue": {"size": {"real_time": 16, "interactive_high": 16}}}
+    if settings.vehicle_id is not None:
+        tree |= _flood_limits(settings.fleet_name, settings.vehicle_id)
     return zenoh.Config.from_json5(json.dumps(tree))
+
+
+def _flood_limits(fleet_name: str, vehicle_id: int) -> dict[str, Any]:
+    """What Zenoh leaves out of what comes in, for each session that is connected.
+
+    It does so in the receiving thread, without the interpreter's lock. These keys have the namespace in front; rules
+    with any others do nothing, and nobody says so.
+    """
+
+    def topic(name: str) -> str:
+        return f"{fleet_name}/fleet/*/{name}"
+
+    def question(kind: str) -> str:
+        return f"{fleet_name}/fleet/{vehicle_id}/{kind}"
+
+    puts = [{"key_expr": topic(name), "freq": hz} for name, hz in PUTS_HZ.items()]
+    queries = [{"key_expr": question(kind), "freq": REQUESTS_HZ} for kind in REQUEST_KINDS]
+    sizes = [
+        ("state", ["put", "reply"], [topic(STATE_TOPIC)], STATE_MAX_BYTES),
+        ("plan", ["put", "reply"], [topic(PLAN_TOPIC)], PAYLOAD_MAX_BYTES),
+        ("command", ["query"], [question("command")], PAYLOAD_MAX_BYTES),
+        ("question", ["query"], [question("status"), question("preflight")], QUESTION_MAX_BYTES),
+    ]
+    return {
+        "downsampling": [
+            {"id": name, "messages": messages, "flows": ["ingress"], "rules": rules}
+            for name, messages, rules in (("puts", ["put", "delete"], puts), ("queries", ["query"], queries))
+        ],
+        "low_pass_filter": [
+            {"id": name, "messages": messages, "flows": ["ingress"], "key_exprs": keys, "size_limit": size}
+            for name, messages, keys, size in sizes
+        ],
+    }
 
 
 def _laptop(settings: PeerNetworkSettings) -> dict[str, Any]:
@@ -267,19 +310,20 @@ class PeerNetwork:
         wake: Callable[[], None],
         *,
         topics: tuple[str, ...] = TOPICS,
-        queue_capacity: int = QUEUE_CAPACITY,
+        states_waiting: int = BOUNDS[STATE_TOPIC].waiting,
     ) -> None:
         if settings.vehicle_id is None:
             raise ValueError("a PeerNetwork belongs to a vehicle; an operator uses OperatorLink")
-        if not queue_capacity > 0:
-            raise ValueError(f"queue_capacity must be > 0, got {queue_capacity}")
+        if not states_waiting > 0:
+            raise ValueError(f"states_waiting must be > 0, got {states_waiting}")
         self._settings = settings
         self._vehicle_id = settings.vehicle_id
         self._wake = wake
         self._topics = topics
-        self._capacity = queue_capacity
         self._lock = threading.Lock()
-        self._queue: deque[PeerMessage | Request] = deque()
+        self._mailbox: Mailbox[PeerMessage | Request] = Mailbox(
+            BOUNDS | {STATE_TOPIC: BOUNDS[STATE_TOPIC]._replace(waiting=states_waiting)}
+        )
         self._presence: dict[int, PresenceChange] = {}
         self._counters = NetworkCounters()
         self._closed = False
@@ -368,19 +412,21 @@ class PeerNetwork:
                 self._counters.publish_failures += 1
 
     def drain(self) -> list[Event]:
-        """Everything received since the last call, in the order of reception.
+        """What has been received since the last call, in the order of reception, no more than one turn can bear.
 
-        A vehicle's presence is told once, as it is now, however often it changed in between.
+        Of what is left the loop is woken again at once. A vehicle's presence is told once, as it is now, however often
+        it changed in between.
         """
-        if not self._queue and not self._presence:
+        if not len(self._mailbox) and not self._presence:
             return []
         with self._lock:
-            events: list[Event] = list(self._queue)
-            self._queue.clear()
+            events: list[Event] = [*self._mailbox.take(), *self._presence.values()]
             if self._presence:
-                events += self._presence.values()
                 self._presence.clear()
                 events.sort(key=_received)
+            more = len(self._mailbox) > 0
+        if more:
+            self._wake()
         return events
 
     @property
@@ -389,7 +435,7 @@ class PeerNetwork:
         with self._lock:
             counters = self._counters
             return NetworkCounters(
-                counters.dropped,
+                self._mailbox.dropped,
                 counters.malformed,
                 counters.own_id_heard,
                 counters.publish_failures,
@@ -399,7 +445,7 @@ class PeerNetwork:
     @property
     def dropped(self) -> int:
         """Events lost because the loop did not drain in time."""
-        return self._counters.dropped
+        return self._mailbox.dropped
 
     @property
     def connected_peers(self) -> int:
@@ -410,19 +456,16 @@ class PeerNetwork:
         """Leave the fleet: the others see this vehicle vanish. May be called again."""
         with self._lock:
             self._closed = True
-            self._queue.clear()
+            self._mailbox.clear()
             self._presence.clear()
         if self._session is not None and not self._session.is_closed():
             _close_session(self._session)
 
-    def _enqueue(self, event: PeerMessage | Request) -> None:
+    def _enqueue(self, kind: str, event: PeerMessage | Request) -> None:
         with self._lock:
             if self._closed:
                 return
-            if len(self._queue) >= self._capacity:
-                self._queue.popleft()
-                self._counters.dropped += 1
-            self._queue.append(event)
+            self._mailbox.put(kind, event)
         self._wake()
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
@@ -437,7 +480,7 @@ class PeerNetwork:
             with self._lock:
                 self._counters.malformed += 1
         else:
-            self._enqueue(PeerMessage(key, payload.to_bytes(), received_ns))
+            self._enqueue(key.rpartition("/")[2], PeerMessage(key, payload.to_bytes(), received_ns))
 
     def _on_liveliness(self, sample: zenoh.Sample) -> None:
         received_ns = time.monotonic_ns()
@@ -463,7 +506,7 @@ class PeerNetwork:
                     self._counters.malformed += 1
                 return
             body = b"" if payload is None else payload.to_bytes()
-            self._enqueue(Request(kind, body, _Reply(query, self._reply_failed).send, received_ns))
+            self._enqueue(kind, Request(kind, body, _Reply(query, self._reply_failed).send, received_ns))
 
         return on_query
 
@@ -497,6 +540,8 @@ class OperatorLink:
         if settings.vehicle_id is not None:
             raise ValueError(f"an OperatorLink has no vehicle id, got {settings.vehicle_id}")
         self._settings = settings
+        self._asked_s: dict[str, float] = {}
+        """kind -> when it was last asked"""
         self._session: zenoh.Session | None = None
 
     def __enter__(self) -> Self:
@@ -558,12 +603,13 @@ class OperatorLink:
         asked_ns: dict[int, int] = {}
         inbox: SimpleQueue[tuple[int, bytes, int]] = SimpleQueue()
         cancellation = zenoh.CancellationToken()
-        now_s = time.monotonic()
+        now_s = self._wait_turn(kind)
         deadline_s = now_s + timeout_s
         next_round_s = now_s
         try:
             while silent and now_s < deadline_s:
                 if now_s >= next_round_s:
+                    self._asked_s[kind] = now_s
                     for vehicle_id in sorted(silent):
                         asked_ns.setdefault(vehicle_id, time.time_ns())
                         session.get(
@@ -591,6 +637,13 @@ class OperatorLink:
         finally:
             cancellation.cancel()  # type: ignore[no-untyped-call]
         return answers
+
+    def _wait_turn(self, kind: str) -> float:
+        """Let ASK_INTERVAL_S pass since the last question of a kind; returns the time then (monotonic, s)."""
+        wait_s = self._asked_s.get(kind, -ASK_INTERVAL_S) + ASK_INTERVAL_S - time.monotonic()
+        if wait_s > 0:
+            time.sleep(min(wait_s, ASK_INTERVAL_S))
+        return time.monotonic()
 
     def _opened(self) -> zenoh.Session:
         if self._session is None:

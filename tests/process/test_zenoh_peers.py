@@ -10,16 +10,22 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TypeVar
 
 import pytest
 import zenoh
+from zenoh.handlers import Callback
 
 from companion.errors import ConfigError
 from companion.io.zenoh_peers import (
+    ASK_INTERVAL_S,
     PAYLOAD_MAX_BYTES,
+    PUTS_HZ,
+    REQUESTS_HZ,
+    STATE_MAX_BYTES,
     Event,
     OperatorLink,
     PeerMessage,
@@ -33,6 +39,7 @@ from companion.io.zenoh_peers import (
     zenoh_configuration,
 )
 
+T = TypeVar("T")
 PATIENCE_S = 10.0
 """how long a test waits for what must come; far above what it takes"""
 
@@ -48,9 +55,9 @@ def fleet() -> str:
 class Vehicle:
     """A PeerNetwork with a loop's mailbox."""
 
-    def __init__(self, settings: PeerNetworkSettings, queue_capacity: int = 4096) -> None:
+    def __init__(self, settings: PeerNetworkSettings, states_waiting: int = 4096) -> None:
         self._woken = threading.Event()
-        self.network = PeerNetwork(settings, self._woken.set, queue_capacity=queue_capacity)
+        self.network = PeerNetwork(settings, self._woken.set, states_waiting=states_waiting)
         self.events: list[Event] = []
 
     def collect(self, enough: Callable[[list[Event]], bool], timeout_s: float = PATIENCE_S) -> bool:
@@ -81,8 +88,8 @@ class Vehicle:
 
 
 @contextmanager
-def vehicle(fleet: str, vehicle_id: int, queue_capacity: int = 4096) -> Iterator[Vehicle]:
-    it = Vehicle(PeerNetworkSettings(fleet, vehicle_id), queue_capacity)
+def vehicle(fleet: str, vehicle_id: int, states_waiting: int = 4096) -> Iterator[Vehicle]:
+    it = Vehicle(PeerNetworkSettings(fleet, vehicle_id), states_waiting)
     with it.network:
         yield it
 
@@ -94,6 +101,14 @@ def eventually(condition: Callable[[], bool]) -> bool:
     while not condition() and time.monotonic() < deadline_s:
         pause.wait(0.005)
     return condition()
+
+
+def paced(items: Iterable[T], topic: str = "state") -> Iterator[T]:
+    """Each at a time of its own, so that none of them is left out as one too many."""
+    pause = threading.Event()
+    for item in items:
+        yield item
+        pause.wait(2.0 / PUTS_HZ[topic])
 
 
 CHILD = """
@@ -327,19 +342,27 @@ def test_foreign_keys_deletions_and_oversized_payloads_are_counted_and_not_deliv
     with vehicle(fleet, 1) as one, zenoh.open(zenoh_configuration(PeerNetworkSettings(fleet, None))) as stranger:
         block = zenoh.CongestionControl.BLOCK
         assert eventually(lambda: len(list(stranger.liveliness().get("fleet/1/alive"))) == 1)
-        for name in ("abc", "0", "007", "251", "-2", "2.0", "1e1", "²"):
+        for name in paced(("abc", "0", "007", "251", "-2", "2.0", "1e1", "²")):
             stranger.put(f"fleet/{name}/state", b"x", congestion_control=block)
+        for size in paced((STATE_MAX_BYTES + 1, STATE_MAX_BYTES)):
+            stranger.put("fleet/3/state", bytes(size), congestion_control=block)
+        for size in paced((PAYLOAD_MAX_BYTES + 1, PAYLOAD_MAX_BYTES), "plan"):
+            stranger.put("fleet/2/plan", bytes(size), congestion_control=block)
         stranger.delete("fleet/2/state", congestion_control=block)
-        stranger.put("fleet/2/state", bytes(PAYLOAD_MAX_BYTES + 1), congestion_control=block)
-        stranger.put("fleet/2/state", b"good", congestion_control=block)
+        for _ in paced(range(2)):
+            stranger.put("fleet/2/state", b"good", congestion_control=block)
         one.wait_message("fleet/2/state", b"good")
-        assert one.messages() == [("fleet/2/state", b"good")]
-        assert one.network.counters.malformed == 10
+        assert one.messages() == [
+            ("fleet/3/state", bytes(STATE_MAX_BYTES)),
+            ("fleet/2/plan", bytes(PAYLOAD_MAX_BYTES)),
+            ("fleet/2/state", b"good"),
+        ]
+        assert one.network.counters.malformed == 9
         token = stranger.liveliness().declare_token("fleet/nobody/alive")
         good = stranger.liveliness().declare_token("fleet/9/alive")
         one.wait_presence(9, True)
         assert one.presence() == [(9, True)]
-        assert one.network.counters.malformed == 11
+        assert one.network.counters.malformed == 10
         del token, good  # held until here: a token that goes is one more sample
 
 
@@ -358,14 +381,63 @@ def test_somebody_else_speaking_under_our_id_is_counted_and_not_delivered(fleet:
 
 @pytest.mark.process
 def test_a_loop_that_does_not_drain_keeps_the_newest_messages_and_every_presence(fleet: str) -> None:
-    with vehicle(fleet, 1, queue_capacity=4) as one, vehicle(fleet, 2) as two:
+    with vehicle(fleet, 1, states_waiting=4) as one, vehicle(fleet, 2) as two:
         two.wait_presence(1, True)
-        for number in range(12):
-            two.network.publish("plan", b"%d" % number)
+        for number in paced(range(12)):
+            two.network.publish("state", b"%d" % number)
         assert eventually(lambda: one.network.dropped == 8)
-        one.wait_message("fleet/2/plan", b"11")
-        assert one.messages() == [("fleet/2/plan", b"%d" % number) for number in range(8, 12)]
+        one.wait_message("fleet/2/state", b"11")
+        assert one.messages() == [("fleet/2/state", b"%d" % number) for number in range(8, 12)]
         assert one.presence() == [(2, True)]
+
+
+@pytest.mark.process
+def test_a_flood_of_one_session_is_thinned_before_it_is_heard_and_others_are_heard_meanwhile(fleet: str) -> None:
+    pause = threading.Event()
+    with (
+        vehicle(fleet, 1) as one,
+        vehicle(fleet, 2) as two,
+        zenoh.open(zenoh_configuration(PeerNetworkSettings(fleet, None))) as stranger,
+    ):
+        two.wait_presence(1, True)
+        one.wait_presence(2, True)
+        assert eventually(lambda: len(list(stranger.liveliness().get("fleet/1/alive"))) == 1)
+        begin_s = time.monotonic()
+        for number in range(600):
+            stranger.put("fleet/3/state", b"%d" % number)
+            stranger.put("fleet/3/plan", b"%d" % number)
+            stranger.get(
+                "fleet/1/status", Callback(lambda _: None, indirect=False), payload=b"%d" % number, timeout=0.5
+            )
+            if number % 100 == 50:
+                two.network.publish("state", b"%d" % number)
+            pause.wait(0.001)
+        spent_s = time.monotonic() - begin_s
+        for number in range(50, 600, 100):
+            one.wait_message("fleet/2/state", b"%d" % number)
+        heard = [key for key, _ in one.messages()]
+        share = {"state": PUTS_HZ["state"], "plan": PUTS_HZ["plan"]}
+        for topic, most_hz in share.items():
+            assert 0 < heard.count(f"fleet/3/{topic}") <= most_hz * spent_s + 2
+        assert 0 < len(one.requests()) <= REQUESTS_HZ * spent_s + 2
+        assert one.network.counters.malformed == 0
+
+
+def test_a_question_too_many_for_a_vehicle_is_one_that_an_operator_does_not_ask() -> None:
+    assert ASK_INTERVAL_S > 1.0 / REQUESTS_HZ
+
+
+@pytest.mark.process
+def test_an_operators_questions_in_quick_succession_are_all_answered_without_a_retry(fleet: str) -> None:
+    with (
+        vehicle(fleet, 1) as one,
+        OperatorLink(PeerNetworkSettings(fleet, None)) as operator,
+        answering(one, echo),
+    ):
+        assert operator.wait_alive([1], PATIENCE_S) == {1}
+        for _ in range(10):
+            assert operator.ask([1], "preflight", b"clock", timeout_s=PATIENCE_S, retry_s=PATIENCE_S)[1] is not None
+        assert len(one.requests()) == 10
 
 
 # Operators
