@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from random import Random
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from companion.core.values import Instant, Phase
 from sim.autopilot import Autopilot
 from sim.network import Network, NetworkParameters
 from sim.stub_fleet import stub_settings
-from sim.stubs import TRUTH_DTYPE, build_autopilot
+from sim.stubs import TRUTH_DTYPE, build_autopilot, truth_record
 
 UTC_AT_START_NS = 1_700_000_000_000_000_000
 LINK_DELAY_NS = 300_000
@@ -28,6 +29,7 @@ LINK_DELAY_NS = 300_000
 PRESENCE_DELAY_NS = 100_000_000
 TRUTH_INTERVAL_NS = 20_000_000
 FOR_EVER_S = 1e9
+NEVER_NS = 1 << 62
 
 
 @dataclass(slots=True)
@@ -69,9 +71,10 @@ class Lockstep:
     """(seconds, vehicle, what happened)"""
     own_id_heard: Counter[int] = field(default_factory=Counter)
     """puts that reached a vehicle under its own id"""
-    _truth: list[np.ndarray] = field(default_factory=list)
+    _truth: list[bytes] = field(default_factory=list)
     _net: Network = field(init=False)
-    _queue: list[tuple[int, int, Callable[[], None]]] = field(default_factory=list)
+    _queue: list[tuple[int, int, Callable[..., None], tuple[Any, ...]]] = field(default_factory=list)
+    """what happens when: (time, order of entry, function, its arguments)"""
     _count: int = 0
     _autopilot_due_ns: dict[int, int] = field(default_factory=dict)
     _agent_due_ns: dict[int, int] = field(default_factory=dict)
@@ -97,6 +100,9 @@ class Lockstep:
             autopilot = build_autopilot(settings, v, boot_ns=0, utc_offset_ns=UTC_AT_START_NS)
             agent = Agent(self.config, v.vehicle_id, boot_id=random.getrandbits(32))
             self.vehicles[v.vehicle_id] = Vehicle(agent, autopilot)
+        # In the vehicles' order from now on: of what is due at one time, the first vehicle's comes first.
+        self._autopilot_due_ns = dict.fromkeys(self.vehicles, 0)
+        self._agent_due_ns = dict.fromkeys(self.vehicles, 0)
         for i in self.vehicles:
             self._announce_presence(i, True)
         self._at(TRUTH_INTERVAL_NS, self._sample_truth)
@@ -106,14 +112,14 @@ class Lockstep:
         """The present, as every agent is told."""
         return Instant(self.now_ns, self.now_ns + UTC_AT_START_NS)
 
-    def _at(self, time_ns: int, action: Callable[[], None]) -> None:
+    def _at(self, time_ns: int, action: Callable[..., None], *arguments: Any) -> None:
         self._count += 1
-        heapq.heappush(self._queue, (time_ns, self._count, action))
+        heapq.heappush(self._queue, (time_ns, self._count, action, arguments))
 
     def _announce_presence(self, i: int, alive: bool) -> None:
         for j in self.vehicles:
             if j != i:
-                self._at(self.now_ns + PRESENCE_DELAY_NS, lambda j=j: self._presence(j, i, alive))  # type: ignore[misc]
+                self._at(self.now_ns + PRESENCE_DELAY_NS, self._presence, j, i, alive)
 
     def _presence(self, receiver: int, about: int, alive: bool) -> None:
         self._touched.add(receiver)
@@ -139,7 +145,7 @@ class Lockstep:
                 next_check_ns = self.now_ns + 100_000_000
                 self._touched.update(self.vehicles)
             self._ask_deadlines()
-            agents_ns = min(self._agent_due_ns.values(), default=end_ns + 1)
+            agents_ns = min(self._agent_due_ns.values())
             for twin in self._twins.values():
                 agents_ns = min(agents_ns, twin.next_deadline_ns())
             time_ns = min(self._queue[0][0], agents_ns, *self._autopilot_due_ns.values())
@@ -156,22 +162,23 @@ class Lockstep:
             if v.alive:
                 self._agent_due_ns[i] = max(v.agent.next_deadline_ns(), self._stalled_until_ns.get(i, 0))
             else:
-                self._agent_due_ns.pop(i, None)
+                self._agent_due_ns[i] = NEVER_NS
         self._touched.clear()
 
     def _step(self) -> None:
         now_ns = self.now_ns
         while self._queue and self._queue[0][0] <= now_ns:
-            heapq.heappop(self._queue)[2]()
+            _, _, action, arguments = heapq.heappop(self._queue)
+            action(*arguments)
         self._ask_deadlines()
-        for i, v in self.vehicles.items():
-            if self._autopilot_due_ns[i] <= now_ns:
+        for i, due_ns in self._autopilot_due_ns.items():
+            if due_ns <= now_ns:
                 self._touched.add(i)
-                datagrams = v.autopilot.advance(now_ns)
+                datagrams = self.vehicles[i].autopilot.advance(now_ns)
                 if datagrams and self._line_works(i):
-                    self._at(now_ns + LINK_DELAY_NS, lambda i=i, d=datagrams: self._to_companion(i, d))  # type: ignore[misc]
-        for i, v in self.vehicles.items():
-            if v.alive and self._agent_due_ns[i] <= now_ns:
+                    self._at(now_ns + LINK_DELAY_NS, self._to_companion, i, datagrams)
+        for i, due_ns in self._agent_due_ns.items():
+            if due_ns <= now_ns:
                 self._touched.add(i)
                 self._advance(i)
         for i, twin in self._twins.items():
@@ -182,14 +189,14 @@ class Lockstep:
         return self.now_ns >= self._line_dead_until_ns.get(i, 0)
 
     def _to_companion(self, i: int, datagrams: Iterable[bytes]) -> None:
-        v = self.vehicles[i]
+        v, twin, now = self.vehicles[i], self._twins.get(i), self.now
         self._touched.add(i)
         for datagram in datagrams:
             if v.alive:
                 self._log(i, "input/mavlink", datagram)
-                v.agent.receive_mavlink(datagram, self.now)
-            if i in self._twins:
-                self._twins[i].receive_mavlink(datagram, self.now)
+                v.agent.receive_mavlink(datagram, now)
+            if twin is not None:
+                twin.receive_mavlink(datagram, now)
 
     def _to_autopilot(self, i: int, datagrams: Iterable[bytes]) -> None:
         self._touched.add(i)
@@ -212,15 +219,15 @@ class Lockstep:
         """What a companion sends goes on its ways, to its autopilot and to all who hear."""
         if out.mavlink and self._line_works(i):
             arrival_ns = self.now_ns + LINK_DELAY_NS + round(self.command_delay_s * 1e9)
-            self._at(arrival_ns, lambda: self._to_autopilot(i, out.mavlink))
+            self._at(arrival_ns, self._to_autopilot, i, out.mavlink)
         for topic, payload in out.peers:
             key = f"fleet/{i}/{topic}"
             if i in self._twins:
-                self._at(self.now_ns + LINK_DELAY_NS, lambda k=key, p=payload: self._to_peer(i, k, p, sender))  # type: ignore[misc]
+                self._at(self.now_ns + LINK_DELAY_NS, self._to_peer, i, key, payload, sender)
             for j in self.vehicles:
                 arrival = None if j == i else self._net.arrival_ns(i, j, self.now_ns)
                 if arrival is not None and (topic, j) not in self._dropped:
-                    self._at(arrival, lambda j=j, p=payload, k=key: self._to_peer(j, k, p, sender))  # type: ignore[misc]
+                    self._at(arrival, self._to_peer, j, key, payload, sender)
 
     def _to_peer(self, j: int, key: str, payload: bytes, sender: Agent | None = None) -> None:
         v = self.vehicles[j]
@@ -325,19 +332,11 @@ class Lockstep:
 
     def truth(self) -> np.ndarray:
         """Every vehicle's true state at 50 Hz, as TRUTH_DTYPE records."""
-        return np.concatenate(self._truth) if self._truth else np.zeros(0, TRUTH_DTYPE)
+        return np.frombuffer(b"".join(self._truth), TRUTH_DTYPE)
 
     def _sample_truth(self) -> None:
-        rows = np.zeros(len(self.vehicles), TRUTH_DTYPE)
-        for row, (i, v) in zip(rows, self.vehicles.items(), strict=True):
-            t = v.autopilot.truth()
-            row["time_unix_ns"] = self.now.fleet_ns
-            row["vehicle_id"], row["armed"], row["landed_state"] = i, t.armed, t.landed_state
-            row["custom_mode"] = t.custom_mode
-            row["position_ned_m"], row["velocity_ned_m_s"] = t.position_ned_m, t.velocity_ned_m_s
-            row["setpoint_gap_max_s"] = t.setpoint_gap_max_s
-            row["attitude_rate_rad_s"] = np.nan
-        self._truth.append(rows)
+        fleet_ns = self.now.fleet_ns
+        self._truth += [truth_record(i, v.autopilot.truth(), fleet_ns) for i, v in self.vehicles.items()]
         self._at(self.now_ns + TRUTH_INTERVAL_NS, self._sample_truth)
 
     def positions(self) -> dict[int, Ned]:
