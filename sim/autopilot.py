@@ -7,13 +7,13 @@ PX4's own simulation step. The same seed and the same calls give the same bytes.
 import os
 import random
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 os.environ["MAVLINK20"] = "1"
 from pymavlink.dialects.v20 import development as mavlink
 
 from companion.core.frames import Geodetic, Ned, ned_to_geodetic
+from companion.wire.mavlink import unpacked, whole_frame
 from sim.dynamics import (
     HOLD_STILL,
     DynamicsParameters,
@@ -22,8 +22,9 @@ from sim.dynamics import (
     OrnsteinUhlenbeck,
     Setpoint,
     Vehicle,
+    normals,
 )
-from sim.px4.commander import HOME_SET_NS, Commander, Result
+from sim.px4.commander import HOME_SET_NS, Commander, Result, TakeoffState
 from sim.px4.commands import CommandRequest, answer, set_mode
 from sim.px4.estimator import Estimator
 from sim.px4.events import EventReporter
@@ -31,7 +32,7 @@ from sim.px4.faults import LASTING, Fault, FaultKind
 from sim.px4.link import COMPONENT_ID, Link, StreamSchedule
 from sim.px4.modes import Mode
 from sim.px4.navigator import Navigator
-from sim.px4.offboard import SetpointStream, decode_setpoint
+from sim.px4.offboard import SetpointFields, SetpointStream, decode_setpoint
 from sim.px4.parameters import ParameterTable, loop_gains
 from sim.px4.services import Services
 from sim.px4.telemetry import Telemetry
@@ -43,14 +44,14 @@ ESTIMATE_STEPS = 2
 """the estimator publishes every so many steps: 125 Hz, as PX4's does"""
 ORIGIN_SENT_NS = 1_800_000_000
 """GPS_GLOBAL_ORIGIN comes by itself once, this long after boot"""
-BATTERY_DRAIN_PER_S = 1.0 / 60.0
-"""while armed; down to half, and full again when disarmed, as recorded"""
+BATTERY_DRAIN_PER_STEP = 1.0 / 60.0 * STEP_S
+"""while armed, a sixtieth a second; down to half, and full again when disarmed, as recorded"""
 BATTERY_LOWEST_FRACTION = 0.5
+SETPOINT = mavlink.MAVLink_set_position_target_local_ned_message
 NO_OFFSET = Ned(0.0, 0.0, 0.0)
 
 
-@dataclass(frozen=True, slots=True)
-class TruthState:
+class TruthState(NamedTuple):
     """What is true of the vehicle, whatever its estimator says."""
 
     time_ns: int
@@ -115,7 +116,7 @@ class Autopilot:
             gust.sigma_m_s2,
             gust.time_constant_s,
             STEP_S,
-            random.Random(f"{self._seed}/gust"),
+            normals(random.Random(f"{self._seed}/gust")),
             gust.bound_m_s2,
         )
         self.rejected: dict[str, int] = {}
@@ -161,6 +162,14 @@ class Autopilot:
     def receive(self, datagram: bytes, now_ns: int) -> None:
         """Takes what arrived from the link at `now_ns`; answers wait for the next `advance`."""
         self._catch_up(now_ns)
+        if whole_frame(datagram) == SETPOINT.id and self.link.mav.buf_len() == 0:
+            # What comes many times a second is read without pymavlink's objects; what is damaged goes the long way.
+            values = unpacked(SETPOINT, datagram)
+            if values is not None:
+                message = SetpointFields(*values)
+                if self._addressed(message):
+                    self._take_setpoint(message)
+                return
         for message in self.link.mav.parse_buffer(datagram) or ():
             if message.get_type() == "BAD_DATA":
                 self._reject("bad_data")
@@ -169,7 +178,7 @@ class Autopilot:
 
     def next_deadline_ns(self) -> int:
         """When `advance` should be called next: on the grid."""
-        if self._services.busy:
+        if self._services.listing:
             due_ns = self.now_ns + STEP_NS
         else:
             due_ns = max(self.schedule.next_due_ns, self.now_ns + STEP_NS)
@@ -191,11 +200,13 @@ class Autopilot:
 
     def truth(self) -> TruthState:
         """What is true at the last step of the grid."""
-        vehicle, commander = self.vehicle, self.commander
+        vehicle, commander, origin = self.vehicle, self.commander, self._origin_ned_m
         last_ns = commander.setpoint_last_ns
         return TruthState(
             time_ns=self._boot_ns + self.now_ns,
-            position_ned_m=_plus(Ned(vehicle.north_m, vehicle.east_m, vehicle.down_m), self._origin_ned_m),
+            position_ned_m=Ned(
+                vehicle.north_m + origin.north, vehicle.east_m + origin.east, vehicle.down_m + origin.down
+            ),
             velocity_ned_m_s=Ned(vehicle.velocity_north_m_s, vehicle.velocity_east_m_s, vehicle.velocity_down_m_s),
             acceleration_ned_m_s2=Ned(
                 vehicle.acceleration_north_m_s2, vehicle.acceleration_east_m_s2, vehicle.acceleration_down_m_s2
@@ -269,9 +280,9 @@ class Autopilot:
             self._step()
 
     def _step(self) -> None:
-        self.now_ns += STEP_NS
+        now = self.now_ns + STEP_NS
+        self.now_ns = self.telemetry.now_ns = self.link.now_ns = now
         self._steps += 1
-        now = self.telemetry.now_ns = self.link.now_ns = self.now_ns
         gust = self._gust
         gust.step()
         self._fly(now)
@@ -289,7 +300,7 @@ class Autopilot:
         if not self._origin_announced and now >= ORIGIN_SENT_NS:
             self._origin_announced = True
             self.schedule.send_one(mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
-        if self._services.busy:
+        if self._services.listing:
             self._services.step()
         if now >= self.schedule.next_due_ns:
             self.schedule.send_due(now)
@@ -308,8 +319,11 @@ class Autopilot:
             return
         if mode is Mode.OFFBOARD:
             self._stream.watch(now_ns, commander.setpoint_last_ns)
-        setpoint = self._setpoint(mode)
-        self._wants_takeoff = self._asks_for_takeoff(mode, setpoint)
+            setpoint = self._stream.setpoint
+        else:
+            setpoint = self._setpoint(mode)
+        if commander.takeoff_state is not TakeoffState.FLIGHT:
+            self._wants_takeoff = self._asks_for_takeoff(mode, setpoint)
         if not commander.motors_run:
             telemetry.setpoint = None
             vehicle.idle()
@@ -322,8 +336,6 @@ class Autopilot:
             commander.choose(Mode.LOITER, now_ns)
 
     def _setpoint(self, mode: Mode) -> Setpoint:
-        if mode is Mode.OFFBOARD:
-            return self._stream.setpoint
         commander, vehicle = self.commander, self.vehicle
         if mode.is_manual and commander.pilot_present:
             return HOLD_STILL
@@ -362,14 +374,15 @@ class Autopilot:
         )
 
     def _drain_battery(self) -> None:
-        telemetry = self.telemetry
+        telemetry, commander = self.telemetry, self.commander
+        fraction = telemetry.battery_fraction
         if telemetry.battery_forced is not None:
-            telemetry.battery_fraction = telemetry.battery_forced
-        elif not self.commander.armed:
-            telemetry.battery_fraction = 1.0
-        elif telemetry.battery_fraction > BATTERY_LOWEST_FRACTION:
-            telemetry.battery_fraction -= BATTERY_DRAIN_PER_S * STEP_S
-        self.commander.battery_fraction = telemetry.battery_fraction
+            fraction = telemetry.battery_forced
+        elif not commander.armed:
+            fraction = 1.0
+        elif fraction > BATTERY_LOWEST_FRACTION:
+            fraction -= BATTERY_DRAIN_PER_STEP
+        telemetry.battery_fraction = commander.battery_fraction = fraction
 
     def _end_faults(self, now_ns: int) -> None:
         for kind in [kind for kind, end_ns in self._fault_ends_ns.items() if now_ns >= end_ns]:
@@ -384,6 +397,7 @@ class Autopilot:
 
     def _apply_parameters(self) -> None:
         self.vehicle.gains = loop_gains(self.parameters)
+        self.commander.read_parameters()
 
     # What commands act on
 

@@ -15,8 +15,9 @@ Two models share one body:
 
 import math
 import random
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from math import isnan
+from math import cos, hypot, isnan, log, remainder, sin, sqrt, tan
 from typing import Literal, NamedTuple
 
 GRAVITY_M_S2 = 9.80665
@@ -46,16 +47,10 @@ class Setpoint(NamedTuple):
 
     def is_flyable(self) -> bool:
         """PX4's own check: every axis is controlled by something, and north and east are given in pairs."""
-        pairs = (
-            (self.north_m, self.east_m),
-            (self.velocity_north_m_s, self.velocity_east_m_s),
-            (self.acceleration_north_m_s2, self.acceleration_east_m_s2),
-        )
-        if any(math.isnan(north) != math.isnan(east) for north, east in pairs):
+        north, east, down, v_north, v_east, v_down, a_north, a_east, a_down = (not isnan(x) for x in self[:9])
+        if north is not east or v_north is not v_east or a_north is not a_east:
             return False
-        horizontal = any(not math.isnan(north) for north, _ in pairs)
-        vertical = (self.down_m, self.velocity_down_m_s, self.acceleration_down_m_s2)
-        return horizontal and not all(math.isnan(value) for value in vertical)
+        return (north or v_north or a_north) and (down or v_down or a_down)
 
 
 HOLD_STILL = Setpoint(velocity_north_m_s=0.0, velocity_east_m_s=0.0, velocity_down_m_s=0.0)
@@ -162,34 +157,44 @@ class LoopGains:
     tilt_max_rad: float = math.radians(45.0)
 
 
+def normals(rng: random.Random) -> Iterator[float]:
+    """Standard normal numbers for ever: those that `rng.gauss(0, 1)` gives, at half its cost (Box and Muller 1958)."""
+    uniform = rng.random
+    while True:
+        angle = uniform() * math.tau
+        radius = sqrt(-2.0 * log(1.0 - uniform()))
+        yield cos(angle) * radius
+        yield sin(angle) * radius
+
+
 class OrnsteinUhlenbeck:
     """Three independent Ornstein-Uhlenbeck processes, started from their stationary distribution."""
 
-    __slots__ = ("_bound", "_decay", "_kick", "_random", "down", "east", "north")
+    __slots__ = ("_bound", "_decay", "_kick", "_normal", "down", "east", "north")
 
     def __init__(
-        self, sigma: float, time_constant_s: float, dt_s: float, rng: random.Random, bound: float = math.inf
+        self, sigma: float, time_constant_s: float, dt_s: float, normal: Iterator[float], bound: float = math.inf
     ) -> None:
         self._bound = bound
         self._decay = math.exp(-dt_s / time_constant_s)
         self._kick = sigma * math.sqrt(1.0 - self._decay * self._decay)
-        self._random = rng
+        self._normal: Callable[[], float] = normal.__next__
         self.north = self.east = self.down = 0.0
         if sigma > 0.0:
-            self.north, self.east, self.down = (self._clip(rng.gauss(0.0, sigma)) for _ in range(3))
+            self.north, self.east, self.down = (self._clip(next(normal) * sigma) for _ in range(3))
 
     def _clip(self, value: float) -> float:
         return min(max(value, -self._bound), self._bound)
 
     def step(self) -> None:
         """Advances by the fixed step given at construction."""
-        if self._kick == 0.0:
+        kick = self._kick
+        if kick == 0.0:
             return
-        gauss = self._random.gauss
-        bound = self._bound
-        north = self.north * self._decay + gauss(0.0, self._kick)
-        east = self.east * self._decay + gauss(0.0, self._kick)
-        down = self.down * self._decay + gauss(0.0, self._kick)
+        normal, decay, bound = self._normal, self._decay, self._bound
+        north = self.north * decay + normal() * kick
+        east = self.east * decay + normal() * kick
+        down = self.down * decay + normal() * kick
         self.north = bound if north > bound else (-bound if north < -bound else north)
         self.east = bound if east > bound else (-bound if east < -bound else east)
         self.down = bound if down > bound else (-bound if down < -bound else down)
@@ -215,11 +220,6 @@ def constrain_horizontal(
     room = first_length * first_length - limit * limit
     scale = -along + math.sqrt(along * along - room)
     return first_north + unit_north * scale, first_east + unit_east * scale
-
-
-def wrap_angle_rad(angle_rad: float) -> float:
-    """The same direction within -pi..pi."""
-    return math.remainder(angle_rad, math.tau)
 
 
 class Vehicle:
@@ -329,14 +329,10 @@ class Vehicle:
     ) -> tuple[float, float, float]:
         """Velocity asked for by the position loop and the feed-forward together, limited; NaN: none."""
         gains = self.gains
-        from_north = gain_horizontal * (setpoint.north_m - self.north_m - self.position_error_north_m)
-        from_east = gain_horizontal * (setpoint.east_m - self.east_m - self.position_error_east_m)
-        from_down = gain_vertical * (setpoint.down_m - self.down_m - self.position_error_down_m)
-        north, east, down = (
-            setpoint.velocity_north_m_s,
-            setpoint.velocity_east_m_s,
-            setpoint.velocity_down_m_s,
-        )
+        north_m, east_m, down_m, north, east, down, _, _, _, _, _ = setpoint
+        from_north = gain_horizontal * (north_m - self.north_m - self.position_error_north_m)
+        from_east = gain_horizontal * (east_m - self.east_m - self.position_error_east_m)
+        from_down = gain_vertical * (down_m - self.down_m - self.position_error_down_m)
         if not isnan(from_north):
             north = from_north if isnan(north) else north + from_north
         else:
@@ -368,23 +364,18 @@ class Vehicle:
         error_east = east - self.velocity_east_m_s - self.velocity_error_east_m_s
         error_down = down - self.velocity_down_m_s - self.velocity_error_down_m_s
         p, d = gains.velocity_horizontal_p, gains.velocity_horizontal_d
-        a_north = setpoint.acceleration_north_m_s2
-        a_east = setpoint.acceleration_east_m_s2
-        a_down = setpoint.acceleration_down_m_s2
-        has_north = not isnan(error_north)
-        has_east = not isnan(error_east)
-        has_down = not isnan(error_down)
-        if has_north:
+        _, _, _, _, _, _, a_north, a_east, a_down, _, _ = setpoint
+        if not isnan(error_north):
             feedback = error_north * p + self._integral_north - self._slope_north * d
             a_north = feedback if isnan(a_north) else a_north + feedback
         else:
             error_north = 0.0
-        if has_east:
+        if not isnan(error_east):
             feedback = error_east * p + self._integral_east - self._slope_east * d
             a_east = feedback if isnan(a_east) else a_east + feedback
         else:
             error_east = 0.0
-        if has_down:
+        if not isnan(error_down):
             feedback = (
                 error_down * gains.velocity_vertical_p
                 + self._integral_down
@@ -394,8 +385,8 @@ class Vehicle:
         else:
             error_down = 0.0
         # Tilt: horizontal force comes from tilting a thrust that carries the weight.
-        limit = GRAVITY_M_S2 * math.tan(gains.tilt_max_rad)
-        wanted = math.hypot(a_north, a_east)
+        limit = GRAVITY_M_S2 * tan(gains.tilt_max_rad)
+        wanted = hypot(a_north, a_east)
         if wanted > limit:
             scale = limit / wanted
             # Anti-windup by tracking what saturation leaves (Rundqwist), as PX4 does.
@@ -412,10 +403,13 @@ class Vehicle:
         elif a_down > most_down:
             a_down = most_down
             error_down = min(error_down, 0.0)
-        self._integral_north += error_north * gains.velocity_horizontal_i * dt_s
-        self._integral_east += error_east * gains.velocity_horizontal_i * dt_s
+        gain = gains.velocity_horizontal_i
+        self._integral_north += error_north * gain * dt_s
+        self._integral_east += error_east * gain * dt_s
         integral_down = self._integral_down + error_down * gains.velocity_vertical_i * dt_s
-        self._integral_down = min(max(integral_down, -GRAVITY_M_S2), GRAVITY_M_S2)
+        if not -GRAVITY_M_S2 <= integral_down <= GRAVITY_M_S2:
+            integral_down = min(max(integral_down, -GRAVITY_M_S2), GRAVITY_M_S2)
+        self._integral_down = integral_down
         self.command_north_m_s2 = a_north
         self.command_east_m_s2 = a_east
         self.command_down_m_s2 = a_down
@@ -437,48 +431,50 @@ class Vehicle:
         self.command_north_m_s2, self.command_east_m_s2, self.command_down_m_s2 = commands
 
     def _turn(self, yaw_rad: float, yaw_rate_rad_s: float, dt_s: float) -> None:
-        limit = self.parameters.yaw_rate_max_rad_s
+        parameters = self.parameters
+        limit = parameters.yaw_rate_max_rad_s
         rate = 0.0 if isnan(yaw_rate_rad_s) else yaw_rate_rad_s
         if not isnan(yaw_rad):
-            rate += self.parameters.yaw_gain_per_s * wrap_angle_rad(yaw_rad - self.yaw_rad)
-        rate = min(max(rate, -limit), limit)
+            rate += parameters.yaw_gain_per_s * remainder(yaw_rad - self.yaw_rad, math.tau)
+        if not -limit <= rate <= limit:
+            rate = min(max(rate, -limit), limit)
         self.yaw_rate_rad_s = rate
         if rate != 0.0:
-            self.yaw_rad = wrap_angle_rad(self.yaw_rad + rate * dt_s)
+            self.yaw_rad = remainder(self.yaw_rad + rate * dt_s, math.tau)
 
     def move(self, gust_north_m_s2: float, gust_east_m_s2: float, gust_down_m_s2: float, dt_s: float) -> None:
         """Integrates the motion over one step: lag, drag, gust, ground."""
         parameters = self.parameters
-        lag = parameters.attitude_lag_s
-        blend = dt_s / (lag + dt_s)
-        self.thrust_north_m_s2 += (self.command_north_m_s2 - self.thrust_north_m_s2) * blend
-        self.thrust_east_m_s2 += (self.command_east_m_s2 - self.thrust_east_m_s2) * blend
-        self.thrust_down_m_s2 += (self.command_down_m_s2 - self.thrust_down_m_s2) * (
-            dt_s / (parameters.thrust_lag_s + dt_s)
-        )
+        blend = dt_s / (parameters.attitude_lag_s + dt_s)
+        north, east, down = self.thrust_north_m_s2, self.thrust_east_m_s2, self.thrust_down_m_s2
+        self.thrust_north_m_s2 = north = north + (self.command_north_m_s2 - north) * blend
+        self.thrust_east_m_s2 = east = east + (self.command_east_m_s2 - east) * blend
+        blend = dt_s / (parameters.thrust_lag_s + dt_s)
+        self.thrust_down_m_s2 = down = down + (self.command_down_m_s2 - down) * blend
         if self.on_ground:
-            if self.thrust_down_m_s2 >= -0.05:
+            if down >= -0.05:
                 self._rest()
                 return
             self.on_ground = False
         drag = parameters.drag_per_s
         # Less thrust than weight also means less horizontal force at the same tilt.
-        loading = 1.0 if parameters.model == "ideal" else (GRAVITY_M_S2 - self.thrust_down_m_s2) / GRAVITY_M_S2
-        a_north = self.thrust_north_m_s2 * loading - drag * self.velocity_north_m_s + gust_north_m_s2
-        a_east = self.thrust_east_m_s2 * loading - drag * self.velocity_east_m_s + gust_east_m_s2
-        a_down = self.thrust_down_m_s2 - drag * self.velocity_down_m_s + gust_down_m_s2
+        loading = 1.0 if parameters.model == "ideal" else (GRAVITY_M_S2 - down) / GRAVITY_M_S2
+        v_north, v_east, v_down = self.velocity_north_m_s, self.velocity_east_m_s, self.velocity_down_m_s
+        a_north = north * loading - drag * v_north + gust_north_m_s2
+        a_east = east * loading - drag * v_east + gust_east_m_s2
+        a_down = down - drag * v_down + gust_down_m_s2
         smooth = dt_s / (self.DERIVATIVE_FILTER_S + dt_s)
         self._slope_north += (a_north - self._slope_north) * smooth
         self._slope_east += (a_east - self._slope_east) * smooth
         self._slope_down += (a_down - self._slope_down) * smooth
         # Exact for an acceleration that is constant over the step.
         half = 0.5 * dt_s
-        self.north_m += (self.velocity_north_m_s + half * a_north) * dt_s
-        self.east_m += (self.velocity_east_m_s + half * a_east) * dt_s
-        self.down_m += (self.velocity_down_m_s + half * a_down) * dt_s
-        self.velocity_north_m_s += a_north * dt_s
-        self.velocity_east_m_s += a_east * dt_s
-        self.velocity_down_m_s += a_down * dt_s
+        self.north_m += (v_north + half * a_north) * dt_s
+        self.east_m += (v_east + half * a_east) * dt_s
+        self.down_m += (v_down + half * a_down) * dt_s
+        self.velocity_north_m_s = v_north + a_north * dt_s
+        self.velocity_east_m_s = v_east + a_east * dt_s
+        self.velocity_down_m_s = v_down + a_down * dt_s
         self.acceleration_north_m_s2 = a_north
         self.acceleration_east_m_s2 = a_east
         self.acceleration_down_m_s2 = a_down
@@ -510,9 +506,9 @@ class Vehicle:
     def attitude_rad(self) -> tuple[float, float, float]:
         """Roll, pitch and yaw of the thrust that is flown."""
         # Before the vertical thrust's loading the tilt is that of (a, g), see `move`.
-        cos_yaw, sin_yaw = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
+        cos_yaw, sin_yaw = cos(self.yaw_rad), sin(self.yaw_rad)
         forward = cos_yaw * self.thrust_north_m_s2 + sin_yaw * self.thrust_east_m_s2
         right = -sin_yaw * self.thrust_north_m_s2 + cos_yaw * self.thrust_east_m_s2
         pitch = -math.atan2(forward, GRAVITY_M_S2)
-        roll = math.atan2(right * math.cos(pitch), GRAVITY_M_S2)
+        roll = math.atan2(right * cos(pitch), GRAVITY_M_S2)
         return roll, pitch, self.yaw_rad

@@ -5,9 +5,11 @@ They speak the real MAVLink and peer bytes; only sockets and waiting are missing
 
 import heapq
 import json
+from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from random import Random
+from typing import Any
 
 import numpy as np
 
@@ -21,13 +23,15 @@ from companion.wire.events import encode_event
 from sim.autopilot import Autopilot
 from sim.network import Network, NetworkParameters
 from sim.stub_fleet import stub_settings
-from sim.stubs import TRUTH_DTYPE, build_autopilot
+from sim.stubs import TRUTH_DTYPE, build_autopilot, truth_record
 
 UTC_AT_START_NS = 1_700_000_000_000_000_000
 LINK_DELAY_NS = 300_000
 """one way between autopilot and companion"""
 PRESENCE_DELAY_NS = 100_000_000
 TRUTH_INTERVAL_NS = 20_000_000
+FOR_EVER_S = 1e9
+NEVER_NS = 1 << 62
 
 
 @dataclass(slots=True)
@@ -69,14 +73,23 @@ class Lockstep:
     """(seconds, vehicle, what happened)"""
     events: list[tuple[int, int, Event]] = field(default_factory=list)
     """(fleet time, vehicle, what happened)"""
-    _truth: list[np.ndarray] = field(default_factory=list)
+    own_id_heard: Counter[int] = field(default_factory=Counter)
+    """puts that reached a vehicle under its own id"""
+    _truth: list[bytes] = field(default_factory=list)
     _net: Network = field(init=False)
-    _queue: list[tuple[int, int, Callable[[], None]]] = field(default_factory=list)
+    _queue: list[tuple[int, int, Callable[..., None], tuple[Any, ...]]] = field(default_factory=list)
+    """what happens when: (time, order of entry, function, its arguments)"""
     _count: int = 0
     _autopilot_due_ns: dict[int, int] = field(default_factory=dict)
     _agent_due_ns: dict[int, int] = field(default_factory=dict)
     """deadlines, kept until something reaches the vehicle: asking all at each step would cost most of the time"""
     _stalled_until_ns: dict[int, int] = field(default_factory=dict)
+    _line_dead_until_ns: dict[int, int] = field(default_factory=dict)
+    """vehicle -> until when nothing passes between its autopilot and its companion"""
+    _dropped: set[tuple[str, int]] = field(default_factory=set)
+    """(topic, receiver): puts that do not arrive, while presence and everything else does"""
+    _twins: dict[int, Agent] = field(default_factory=dict)
+    """second companions, by the id that they share"""
     _orders: int = 0
     """revision of the last command that came without one"""
     _touched: set[int] = field(default_factory=set)
@@ -91,6 +104,9 @@ class Lockstep:
             autopilot = build_autopilot(settings, v, boot_ns=0, utc_offset_ns=UTC_AT_START_NS)
             agent = Agent(self.config, v.vehicle_id, boot_id=random.getrandbits(32))
             self.vehicles[v.vehicle_id] = Vehicle(agent, autopilot)
+        # In the vehicles' order from now on: of what is due at one time, the first vehicle's comes first.
+        self._autopilot_due_ns = dict.fromkeys(self.vehicles, 0)
+        self._agent_due_ns = dict.fromkeys(self.vehicles, 0)
         for i in self.vehicles:
             self._announce_presence(i, True)
         self._at(TRUTH_INTERVAL_NS, self._sample_truth)
@@ -100,14 +116,14 @@ class Lockstep:
         """The present, as every agent is told."""
         return Instant(self.now_ns, self.now_ns + UTC_AT_START_NS)
 
-    def _at(self, time_ns: int, action: Callable[[], None]) -> None:
+    def _at(self, time_ns: int, action: Callable[..., None], *arguments: Any) -> None:
         self._count += 1
-        heapq.heappush(self._queue, (time_ns, self._count, action))
+        heapq.heappush(self._queue, (time_ns, self._count, action, arguments))
 
     def _announce_presence(self, i: int, alive: bool) -> None:
         for j in self.vehicles:
             if j != i:
-                self._at(self.now_ns + PRESENCE_DELAY_NS, lambda j=j: self._presence(j, i, alive))  # type: ignore[misc]
+                self._at(self.now_ns + PRESENCE_DELAY_NS, self._presence, j, i, alive)
 
     def _presence(self, receiver: int, about: int, alive: bool) -> None:
         self._touched.add(receiver)
@@ -133,7 +149,9 @@ class Lockstep:
                 next_check_ns = self.now_ns + 100_000_000
                 self._touched.update(self.vehicles)
             self._ask_deadlines()
-            agents_ns = min(self._agent_due_ns.values(), default=end_ns + 1)
+            agents_ns = min(self._agent_due_ns.values())
+            for twin in self._twins.values():
+                agents_ns = min(agents_ns, twin.next_deadline_ns())
             time_ns = min(self._queue[0][0], agents_ns, *self._autopilot_due_ns.values())
             if time_ns > end_ns:
                 self.now_ns = end_ns
@@ -148,33 +166,41 @@ class Lockstep:
             if v.alive:
                 self._agent_due_ns[i] = max(v.agent.next_deadline_ns(), self._stalled_until_ns.get(i, 0))
             else:
-                self._agent_due_ns.pop(i, None)
+                self._agent_due_ns[i] = NEVER_NS
         self._touched.clear()
 
     def _step(self) -> None:
         now_ns = self.now_ns
         while self._queue and self._queue[0][0] <= now_ns:
-            heapq.heappop(self._queue)[2]()
+            _, _, action, arguments = heapq.heappop(self._queue)
+            action(*arguments)
         self._ask_deadlines()
-        for i, v in self.vehicles.items():
-            if self._autopilot_due_ns[i] <= now_ns:
+        for i, due_ns in self._autopilot_due_ns.items():
+            if due_ns <= now_ns:
                 self._touched.add(i)
-                datagrams = v.autopilot.advance(now_ns)
-                if datagrams and v.alive:
-                    self._at(now_ns + LINK_DELAY_NS, lambda i=i, d=datagrams: self._to_companion(i, d))  # type: ignore[misc]
-        for i, v in self.vehicles.items():
-            if v.alive and self._agent_due_ns[i] <= now_ns:
+                datagrams = self.vehicles[i].autopilot.advance(now_ns)
+                if datagrams and self._line_works(i):
+                    self._at(now_ns + LINK_DELAY_NS, self._to_companion, i, datagrams)
+        for i, due_ns in self._agent_due_ns.items():
+            if due_ns <= now_ns:
                 self._touched.add(i)
                 self._advance(i)
+        for i, twin in self._twins.items():
+            if twin.next_deadline_ns() <= now_ns:
+                self._send(i, twin.advance(self.now), twin)
+
+    def _line_works(self, i: int) -> bool:
+        return self.now_ns >= self._line_dead_until_ns.get(i, 0)
 
     def _to_companion(self, i: int, datagrams: Iterable[bytes]) -> None:
-        v = self.vehicles[i]
+        v, twin, now = self.vehicles[i], self._twins.get(i), self.now
         self._touched.add(i)
-        if not v.alive:
-            return
         for datagram in datagrams:
-            self._log(i, "input/mavlink", datagram)
-            v.agent.receive_mavlink(datagram, self.now)
+            if v.alive:
+                self._log(i, "input/mavlink", datagram)
+                v.agent.receive_mavlink(datagram, now)
+            if twin is not None:
+                twin.receive_mavlink(datagram, now)
 
     def _to_autopilot(self, i: int, datagrams: Iterable[bytes]) -> None:
         self._touched.add(i)
@@ -187,28 +213,41 @@ class Lockstep:
         out: Outputs = v.agent.advance(self.now)
         for datagram in out.mavlink:
             self._log(i, "output/mavlink", datagram)
-        if out.mavlink:
-            arrival_ns = self.now_ns + LINK_DELAY_NS + round(self.command_delay_s * 1e9)
-            self._at(arrival_ns, lambda: self._to_autopilot(i, out.mavlink))
         for topic, payload in out.peers:
             self._log(i, "output/peer", f"{topic}\0".encode() + payload)
             self.sent.append(Sent(self.now_ns, i, topic, len(payload)))
-            key = f"fleet/{i}/{topic}"
-            for j in self.vehicles:
-                arrival = None if j == i else self._net.arrival_ns(i, j, self.now_ns)
-                if arrival is not None:
-                    self._at(arrival, lambda j=j, p=payload, k=key: self._to_peer(j, k, p))  # type: ignore[misc]
         for event in out.events:
             self._log(i, "event", encode_event(event))
             self.events.append((self.now.fleet_ns, i, event))
         self.notes += [(self.now_ns * 1e-9, i, note) for note in out.notes]
+        self._send(i, out, v.agent)
 
-    def _to_peer(self, j: int, key: str, payload: bytes) -> None:
+    def _send(self, i: int, out: Outputs, sender: Agent) -> None:
+        """What a companion sends goes on its ways, to its autopilot and to all who hear."""
+        if out.mavlink and self._line_works(i):
+            arrival_ns = self.now_ns + LINK_DELAY_NS + round(self.command_delay_s * 1e9)
+            self._at(arrival_ns, self._to_autopilot, i, out.mavlink)
+        for topic, payload in out.peers:
+            key = f"fleet/{i}/{topic}"
+            if i in self._twins:
+                self._at(self.now_ns + LINK_DELAY_NS, self._to_peer, i, key, payload, sender)
+            for j in self.vehicles:
+                arrival = None if j == i else self._net.arrival_ns(i, j, self.now_ns)
+                if arrival is not None and (topic, j) not in self._dropped:
+                    self._at(arrival, self._to_peer, j, key, payload, sender)
+
+    def _to_peer(self, j: int, key: str, payload: bytes, sender: Agent | None = None) -> None:
         v = self.vehicles[j]
         self._touched.add(j)
-        if v.alive:
-            self._log(j, "input/peer", key.encode() + b"\0" + payload)
-            v.agent.receive_peer(key, payload, self.now)
+        for agent in (v.agent if v.alive else None, self._twins.get(j)):
+            if agent is None or agent is sender:
+                continue
+            if key.split("/")[-2] == str(j):
+                self.own_id_heard[j] += 1  # the process keeps it from its agent
+                continue
+            if agent is v.agent:
+                self._log(j, "input/peer", key.encode() + b"\0" + payload)
+            agent.receive_peer(key, payload, self.now)
 
     # -- what a test or a study does with it -------------------------------------------------------------------------
 
@@ -251,9 +290,14 @@ class Lockstep:
         self.vehicles[i].alive = False
         self._announce_presence(i, False)
 
-    def restart(self, i: int) -> None:
-        """Start a killed companion anew, with nothing of its memory."""
+    def restart(self, i: int, line_dead_s: float = 0.0) -> None:
+        """Start a killed companion anew, with nothing of its memory; the line to its autopilot may be dead for a while.
+
+        An infinite time means that it stays dead.
+        """
         v = self.vehicles[i]
+        if line_dead_s > 0.0:
+            self.cut_line(i, line_dead_s)
         self.vehicles[i] = replace(
             v, agent=Agent(self.config, i, boot_id=Random(f"{self.seed}/{i}/{self.now_ns}").getrandbits(32)), alive=True
         )
@@ -262,6 +306,29 @@ class Lockstep:
     def partition(self, *parts: Iterable[int]) -> None:
         """Cut the network into parts that do not hear each other; no parts: it is whole again."""
         self._net.partitions = tuple(frozenset(p) for p in parts)
+
+    def cut_line(self, i: int, seconds: float) -> None:
+        """Let nothing pass between a vehicle's autopilot and its companion for a while, or for ever (infinite)."""
+        self._line_dead_until_ns[i] = self.now_ns + round(min(seconds, FOR_EVER_S) * 1e9)
+
+    def drop_topic(self, topic: str, *receivers: int) -> None:
+        """Lose every put of one topic ("state", "plan") on its way to some vehicles, or to all; presence is kept."""
+        self._dropped.update((topic, j) for j in receivers or self.vehicles)
+
+    def restore_topics(self) -> None:
+        """Every topic arrives again."""
+        self._dropped.clear()
+
+    def inject_peer(self, key: str, payload: bytes, *receivers: int) -> None:
+        """A put of somebody else's under that key, heard at once by some vehicles, or by all but the key's own."""
+        own = key.split("/")[-2]
+        for j in receivers or [j for j in self.vehicles if str(j) != own]:
+            self._to_peer(j, key, payload)
+
+    def add_twin(self, i: int) -> Agent:
+        """A second companion under vehicle i's id, on the same autopilot's line, as behind a MAVLink router."""
+        self._twins[i] = Agent(self.config, i, boot_id=Random(f"{self.seed}/{i}/twin/{self.now_ns}").getrandbits(32))
+        return self._twins[i]
 
     def phases(self) -> dict[int, Phase]:
         """Each running companion's phase."""
@@ -273,19 +340,11 @@ class Lockstep:
 
     def truth(self) -> np.ndarray:
         """Every vehicle's true state at 50 Hz, as TRUTH_DTYPE records."""
-        return np.concatenate(self._truth) if self._truth else np.zeros(0, TRUTH_DTYPE)
+        return np.frombuffer(b"".join(self._truth), TRUTH_DTYPE)
 
     def _sample_truth(self) -> None:
-        rows = np.zeros(len(self.vehicles), TRUTH_DTYPE)
-        for row, (i, v) in zip(rows, self.vehicles.items(), strict=True):
-            t = v.autopilot.truth()
-            row["time_unix_ns"] = self.now.fleet_ns
-            row["vehicle_id"], row["armed"], row["landed_state"] = i, t.armed, t.landed_state
-            row["custom_mode"] = t.custom_mode
-            row["position_ned_m"], row["velocity_ned_m_s"] = t.position_ned_m, t.velocity_ned_m_s
-            row["setpoint_gap_max_s"] = t.setpoint_gap_max_s
-            row["attitude_rate_rad_s"] = np.nan
-        self._truth.append(rows)
+        fleet_ns = self.now.fleet_ns
+        self._truth += [truth_record(i, v.autopilot.truth(), fleet_ns) for i, v in self.vehicles.items()]
         self._at(self.now_ns + TRUTH_INTERVAL_NS, self._sample_truth)
 
     def positions(self) -> dict[int, Ned]:

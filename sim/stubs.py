@@ -24,7 +24,7 @@ import numpy as np
 
 from companion.core.frames import Geodetic, Ned
 from companion.errors import CompanionError
-from sim.autopilot import NO_OFFSET, Autopilot
+from sim.autopilot import NO_OFFSET, Autopilot, TruthState
 from sim.dynamics import DynamicsParameters, GustParameters, NoiseParameters
 from sim.ground import GroundLink
 from sim.px4.faults import decode_order
@@ -102,6 +102,21 @@ class StubFleetSettings:
     """whether the vehicles also speak to a ground station and PX4's viewer (`sim.ground`)"""
 
 
+def truth_record(vehicle_id: int, state: TruthState, time_unix_ns: int) -> bytes:
+    """One record of TRUTH_DTYPE."""
+    return _TRUTH_RECORD.pack(
+        time_unix_ns,
+        vehicle_id,
+        state.armed,
+        state.landed_state,
+        state.custom_mode,
+        *state.position_ned_m,
+        *state.velocity_ned_m_s,
+        state.setpoint_gap_max_s,
+        math.nan,  # a point mass has no attitude rate to speak of
+    )
+
+
 class _TruthRecorder:
     """Appends every vehicle's true state at 50 Hz."""
 
@@ -114,19 +129,7 @@ class _TruthRecorder:
         records = []
         for vehicle_id, autopilot in vehicles:
             state = autopilot.truth()
-            records.append(
-                _TRUTH_RECORD.pack(
-                    state.time_ns + utc_offset_ns,
-                    vehicle_id,
-                    state.armed,
-                    state.landed_state,
-                    state.custom_mode,
-                    *state.position_ned_m,
-                    *state.velocity_ned_m_s,
-                    state.setpoint_gap_max_s,
-                    math.nan,  # a point mass has no attitude rate to speak of
-                )
-            )
+            records.append(truth_record(vehicle_id, state, state.time_ns + utc_offset_ns))
         # A full disk ends the record, not the flight.
         with suppress(OSError):
             self._file.write(b"".join(records))

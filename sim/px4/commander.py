@@ -75,8 +75,22 @@ class Commander:
         self._ramp_start_ns = 0
         self._contact_ns: int | None = None
         self._landed_at_ns: int | None = None
+        self._setpoint_silence_ns = self._spoolup_ns = self._landing_trigger_ns = 0
+        self._ramp_s = self._speed_up_max_m_s = self._ramp_start_m_s = self._battery_critical = 0.0
+        self.read_parameters()
         self.on_home_moved: Callable[[], None] = lambda: None
         """called when PX4 would set home anew: arming, lift-off, disarming"""
+
+    def read_parameters(self) -> None:
+        """Take over the parameters that are looked at in every step; to be called when any has changed."""
+        number = self._parameters.number
+        self._setpoint_silence_ns = round(number("COM_OF_LOSS_T") * SECOND_NS)
+        self._spoolup_ns = round(number("COM_SPOOLUP_TIME") * SECOND_NS)
+        self._landing_trigger_ns = round(number("LNDMC_TRIG_TIME") * SECOND_NS)
+        self._ramp_s = number("MPC_TKO_RAMP_T")
+        self._speed_up_max_m_s = number("MPC_Z_VEL_MAX_UP")
+        self._ramp_start_m_s = -GRAVITY_M_S2 / max(number("MPC_Z_VEL_P_ACC"), 0.1)
+        self._battery_critical = number("BAT_CRIT_THR")
 
     # What is true of the present state
 
@@ -88,7 +102,7 @@ class Commander:
         """The last valid offboard set-point is younger than COM_OF_LOSS_T."""
         if self.setpoint_last_ns is None:
             return False
-        return now_ns - self.setpoint_last_ns <= round(self._parameters.number("COM_OF_LOSS_T") * SECOND_NS)
+        return now_ns - self.setpoint_last_ns <= self._setpoint_silence_ns
 
     def may_fly(self, mode: Mode, now_ns: int) -> bool:
         """What `mode` needs is there."""
@@ -196,12 +210,14 @@ class Commander:
 
     def step(self, now_ns: int, *, wants_takeoff: bool) -> None:
         """Failsafes, take-off state, landing detection, auto-disarm."""
-        if self.armed and self.killed and now_ns - self._killed_at_ns >= KILL_DISARM_NS:
+        if self.killed and self.armed and now_ns - self._killed_at_ns >= KILL_DISARM_NS:
             self._disarm()
         self._choose_active(now_ns)
-        self._step_takeoff(now_ns, wants_takeoff)
+        if self.takeoff_state is not TakeoffState.FLIGHT or not self.armed:
+            self._step_takeoff(now_ns, wants_takeoff)
         self._step_landed(now_ns)
-        self._step_auto_disarm(now_ns)
+        if self.armed and self.landed_state is LandedState.ON_GROUND:
+            self._step_auto_disarm(now_ns)
 
     def _choose_active(self, now_ns: int) -> None:
         if self.mode is Mode.TERMINATION:
@@ -209,7 +225,7 @@ class Commander:
         if not self.armed:
             self.mode, self.failsafe = self.user_mode, False
             return
-        battery_mode = self._battery_action()
+        battery_mode = None if self.battery_fraction >= self._battery_critical else self._battery_action()
         if self.user_mode is Mode.OFFBOARD and not self.may_fly(Mode.OFFBOARD, now_ns):
             self._lose_offboard()
         elif not self.position_valid and (self.user_mode.is_auto or self.user_mode is Mode.POSCTL):
@@ -221,9 +237,7 @@ class Commander:
             self.mode, self.failsafe = self.user_mode, False
 
     def _battery_action(self) -> Mode | None:
-        """COM_LOW_BAT_ACT: 0 warns, 2 lands when critical, 3 returns when critical and lands in an emergency."""
-        if self.battery_fraction >= self._parameters.number("BAT_CRIT_THR"):
-            return None
+        """Of a critical battery. COM_LOW_BAT_ACT: 0 warns, 2 lands, 3 returns, and lands in an emergency."""
         action = self._parameters.integer("COM_LOW_BAT_ACT")
         if action == 2:
             return Mode.LAND
@@ -250,10 +264,8 @@ class Commander:
         state = self.takeoff_state
         if state is TakeoffState.DISARMED:
             state = TakeoffState.SPOOLUP
-        if state is TakeoffState.SPOOLUP:
-            spoolup_ns = round(self._parameters.number("COM_SPOOLUP_TIME") * SECOND_NS)
-            if now_ns - self._armed_at_ns >= spoolup_ns:
-                state = TakeoffState.READY
+        if state is TakeoffState.SPOOLUP and now_ns - self._armed_at_ns >= self._spoolup_ns:
+            state = TakeoffState.READY
         if state is TakeoffState.READY and wants_takeoff:
             state = TakeoffState.RAMPUP
             self._ramp_start_ns = now_ns
@@ -263,7 +275,7 @@ class Commander:
         self.takeoff_state = state
 
     def _ramp_progress(self, now_ns: int) -> float:
-        duration_ns = self._parameters.number("MPC_TKO_RAMP_T") * SECOND_NS
+        duration_ns = self._ramp_s * SECOND_NS
         return 1.0 if duration_ns <= 0.0 else (now_ns - self._ramp_start_ns) / duration_ns
 
     @property
@@ -273,11 +285,11 @@ class Commander:
 
     def speed_up_limit_m_s(self, now_ns: int) -> float:
         """Largest climb rate allowed now; the take-off ramp begins where the loop gives no thrust at all."""
-        limit_m_s = self._parameters.number("MPC_Z_VEL_MAX_UP")
+        limit_m_s = self._speed_up_max_m_s
         if self.takeoff_state is not TakeoffState.RAMPUP:
             return limit_m_s
-        start = -GRAVITY_M_S2 / max(self._parameters.number("MPC_Z_VEL_P_ACC"), 0.1)
-        return start + (limit_m_s - start) * min(self._ramp_progress(now_ns), 1.0)
+        start_m_s = self._ramp_start_m_s
+        return start_m_s + (limit_m_s - start_m_s) * min(self._ramp_progress(now_ns), 1.0)
 
     def _step_landed(self, now_ns: int) -> None:
         vehicle = self._vehicle
@@ -285,14 +297,14 @@ class Commander:
             self.landed_state = LandedState.ON_GROUND  # PX4 takes whatever is disarmed for landed
             self._contact_ns = None
             return
-        if self.on_ground:
+        if self.landed_state is LandedState.ON_GROUND:
             thrust_builds_up = vehicle.thrust_down_m_s2 < 0.7 * GRAVITY_M_S2
             if not vehicle.on_ground or (self.takeoff_state is TakeoffState.RAMPUP and thrust_builds_up):
                 self._lift_off()
-        elif vehicle.presses_down() and self.takeoff_state is not TakeoffState.RAMPUP:
+        elif vehicle.on_ground and self.takeoff_state is not TakeoffState.RAMPUP and vehicle.presses_down():
             if self._contact_ns is None:
                 self._contact_ns = now_ns
-            trigger_ns = round(self._parameters.number("LNDMC_TRIG_TIME") * SECOND_NS)
+            trigger_ns = self._landing_trigger_ns
             if now_ns - self._contact_ns >= trigger_ns:
                 self.landed_state = LandedState.ON_GROUND
                 self._landed_at_ns = now_ns
@@ -300,7 +312,7 @@ class Commander:
                 self.takeoff_state = TakeoffState.READY  # "maybe landed": the motors idle
         else:
             self._contact_ns = None
-        if not self.on_ground:
+        if self.landed_state is not LandedState.ON_GROUND:
             if self.mode is Mode.TAKEOFF:
                 self.landed_state = LandedState.TAKEOFF
             elif self.mode is Mode.LAND:
@@ -315,8 +327,6 @@ class Commander:
         self.on_home_moved()
 
     def _step_auto_disarm(self, now_ns: int) -> None:
-        if not self.armed or not self.on_ground:
-            return
         if self._landed_at_ns is not None:
             delay, since = self._parameters.number("COM_DISARM_LAND"), self._landed_at_ns
         else:

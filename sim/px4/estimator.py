@@ -3,7 +3,7 @@
 import math
 import random
 
-from sim.dynamics import GRAVITY_M_S2, NoiseParameters, OrnsteinUhlenbeck, Vehicle
+from sim.dynamics import GRAVITY_M_S2, NoiseParameters, OrnsteinUhlenbeck, Vehicle, normals
 from sim.px4.telemetry import Telemetry
 
 NO_AID_TIMEOUT_NS = 5_000_000_000
@@ -27,19 +27,21 @@ class Estimator:
         self._vehicle = vehicle
         self._telemetry = telemetry
         self._step_s = step_s
-        self._white = random.Random(f"{seed}/velocity")
+        self._white = normals(random.Random(f"{seed}/velocity")).__next__
         self._faulty = random.Random(f"{seed}/faults")
+        self._faulty_normal = normals(self._faulty)
         self._position = OrnsteinUhlenbeck(
-            noise.position_sigma_m, noise.position_time_constant_s, step_s, random.Random(f"{seed}/position")
+            noise.position_sigma_m, noise.position_time_constant_s, step_s, normals(random.Random(f"{seed}/position"))
         )
         self._bias = OrnsteinUhlenbeck(
             noise.velocity_bias_sigma_m_s,
             noise.velocity_bias_time_constant_s,
             step_s,
-            random.Random(f"{seed}/bias"),
+            normals(random.Random(f"{seed}/bias")),
         )
         self._extra_position: OrnsteinUhlenbeck | None = None
-        self._extra_velocity_sigma = 0.0
+        self._velocity_sigma = noise.velocity_sigma_m_s
+        """of the white noise that is reported (m/s)"""
         self._drift_velocity: tuple[float, float] | None = None
         self._drift = (0.0, 0.0)
         self._gps_lost_ns: int | None = None
@@ -74,11 +76,11 @@ class Estimator:
 
     def add_noise(self, sigma: float) -> None:
         """More error on top: sigma m of position (correlated) and sigma m/s of velocity (white); 0 ends it."""
-        self._extra_velocity_sigma = sigma
+        self._velocity_sigma = math.hypot(self._noise.velocity_sigma_m_s, sigma)
         self._extra_position = None
         if sigma > 0.0:
             self._extra_position = OrnsteinUhlenbeck(
-                sigma, self._noise.position_time_constant_s, self._step_s, self._faulty
+                sigma, self._noise.position_time_constant_s, self._step_s, self._faulty_normal
             )
 
     # One step
@@ -124,7 +126,7 @@ class Estimator:
         elif not self._climb_seen and self._telemetry.height_m > STEP_HEIGHT_M:
             self._climb_seen = True
             if self._noise.position_sigma_m > 0.0:
-                self._step_down = self._faulty.gauss(0.0, STEP_SIGMA_M)
+                self._step_down = next(self._faulty_normal) * STEP_SIGMA_M
                 self._telemetry.count_reset()
 
     def _publish(self, now_ns: int) -> None:
@@ -137,12 +139,12 @@ class Estimator:
         north = vehicle.velocity_north_m_s + vehicle.velocity_error_north_m_s
         east = vehicle.velocity_east_m_s + vehicle.velocity_error_east_m_s
         down = vehicle.velocity_down_m_s + vehicle.velocity_error_down_m_s
-        sigma = math.hypot(self._noise.velocity_sigma_m_s, self._extra_velocity_sigma)
+        sigma = self._velocity_sigma
         if sigma > 0.0:
-            gauss = self._white.gauss
-            north += gauss(0.0, sigma)
-            east += gauss(0.0, sigma)
-            down += gauss(0.0, sigma)
+            white = self._white
+            north += white() * sigma
+            east += white() * sigma
+            down += white() * sigma
         telemetry.velocity_north_m_s = north
         telemetry.velocity_east_m_s = east
         telemetry.velocity_down_m_s = down

@@ -9,7 +9,8 @@ from typing import Any
 os.environ["MAVLINK20"] = "1"
 from pymavlink.dialects.v20 import development as mavlink
 
-from sim.px4.streams import ON_REQUEST, STREAMS
+from companion.wire.mavlink import frame, packed
+from sim.px4.streams import ON_REQUEST, STREAMS, Fields
 from sim.px4.telemetry import Telemetry
 
 FIRST_MESSAGE_NS = 1_600_000_000
@@ -35,8 +36,8 @@ class Link:
 
     def send(self, message: Any) -> None:
         """Packs one message; it leaves at the next `take`, or later where the link is slow."""
-        packet: bytes = message.pack(self.mav)
-        self._enqueue(packet)
+        fields = type(message) is Fields
+        self._enqueue(frame(message.kind, message.values, self.mav) if fields else packed(message, self.mav))
 
     def send_payload(self, message_id: int, crc_extra: int, payload: bytes) -> None:
         """The same for a message that pymavlink does not know."""

@@ -2,6 +2,9 @@
 
 from enum import Enum, IntEnum
 
+AUTO_MAIN_MODE = 4
+MANUAL_MAIN_MODES = frozenset({1, 2, 3, 5, 7})
+
 
 class Mode(Enum):
     """PX4's flight modes: main mode and sub-mode, which custom_mode packs as main << 16 | sub << 24."""
@@ -19,25 +22,16 @@ class Mode(Enum):
     STABILIZED = (7, 0)
     TERMINATION = (10, 0)
 
-    @property
-    def custom_mode(self) -> int:
-        """HEARTBEAT.custom_mode of this mode."""
-        main, sub = self.value
-        return int(main) << 16 | int(sub) << 24
-
-    @property
-    def is_manual(self) -> bool:
-        """Needs a pilot's sticks."""
-        return self in MANUAL_MODES
-
-    @property
-    def is_auto(self) -> bool:
-        """Flown by the autopilot alone."""
-        return self.value[0] == AUTO_MAIN_MODE
+    def __init__(self, main: int, sub: int) -> None:
+        # Plain attributes: they are asked for at every step of every vehicle.
+        self.custom_mode = main << 16 | sub << 24
+        """HEARTBEAT.custom_mode of this mode"""
+        self.is_manual = main in MANUAL_MAIN_MODES
+        """needs a pilot's sticks"""
+        self.is_auto = main == AUTO_MAIN_MODE
+        """flown by the autopilot alone"""
 
 
-AUTO_MAIN_MODE = 4
-MANUAL_MODES = frozenset({Mode.MANUAL, Mode.ALTCTL, Mode.POSCTL, Mode.ACRO, Mode.STABILIZED})
 MODE_OF_CUSTOM = {mode.custom_mode: mode for mode in Mode}
 MAIN_MODES = frozenset(mode.value[0] for mode in Mode)
 

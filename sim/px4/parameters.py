@@ -122,7 +122,7 @@ class ParameterTable:
 
     def number(self, name: str) -> float:
         """Value of any parameter as a float."""
-        return float(self._values[name])
+        return self._values[name]
 
     def integer(self, name: str) -> int:
         """Value of an INT32 parameter."""

@@ -24,17 +24,13 @@ class Services:
         self._link = link
         self._parameters = parameters
         self._on_parameter_changed = on_parameter_changed
-        self._listing: list[int] = []
-
-    @property
-    def busy(self) -> bool:
-        """A parameter list is being sent."""
-        return bool(self._listing)
+        self.listing: list[int] = []
+        """indices of the parameter list that is being sent"""
 
     def step(self) -> None:
         """Goes on with the parameter list, one a step."""
-        if self._listing:
-            self._send_parameter(self._listing.pop(0))
+        if self.listing:
+            self._send_parameter(self.listing.pop(0))
 
     def synchronise(self, message: Any) -> None:
         """TIMESYNC: own boot time back, the other's mirrored."""
@@ -52,7 +48,7 @@ class Services:
 
     def list_parameters(self) -> None:
         """PARAM_REQUEST_LIST: the hash first, then all by index."""
-        self._listing = [HASH_INDEX, *range(len(self._parameters))]
+        self.listing = [HASH_INDEX, *range(len(self._parameters))]
 
     def read_parameter(self, message: Any) -> None:
         """PARAM_REQUEST_READ, by index or by name; silence on what there is not."""

@@ -6,7 +6,7 @@ Every message is built from the one `Telemetry`, so that all of them tell of one
 import math
 import os
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 os.environ["MAVLINK20"] = "1"
 # CURRENT_MODE (436) is not in the `common` dialect of pymavlink 2.4; `development` includes all of `common`.
@@ -39,6 +39,17 @@ CAPABILITIES = (
 POSITION_IGNORED = 0x7
 VELOCITY_IGNORED = 0x38
 NAN_COVARIANCE = [NAN] * 21
+
+
+class Fields(NamedTuple):
+    """A message that a companion has sent many times a second, without pymavlink's object around its values."""
+
+    kind: Any
+    """its class in pymavlink"""
+    values: tuple[Any, ...]
+    """of its fields in the wire's order"""
+
+
 STANDARD_PRESSURE_HPA = 1013.25
 
 
@@ -89,14 +100,17 @@ def _global_position_int(s: Telemetry) -> Any:
 
 
 def _local_position_ned(s: Telemetry) -> Any:
-    return mavlink.MAVLink_local_position_ned_message(
-        s.boot_ms,
-        s.north_m,
-        s.east_m,
-        s.down_m,
-        s.velocity_north_m_s,
-        s.velocity_east_m_s,
-        s.velocity_down_m_s,
+    return Fields(
+        mavlink.MAVLink_local_position_ned_message,
+        (
+            s.boot_ms,
+            s.north_m,
+            s.east_m,
+            s.down_m,
+            s.velocity_north_m_s,
+            s.velocity_east_m_s,
+            s.velocity_down_m_s,
+        ),
     )
 
 
@@ -321,7 +335,7 @@ def _gps_raw_int(s: Telemetry) -> Any:
 
 
 def _extended_sys_state(s: Telemetry) -> Any:
-    return mavlink.MAVLink_extended_sys_state_message(0, int(s.commander.landed_state))
+    return Fields(mavlink.MAVLink_extended_sys_state_message, (0, s.commander.landed_state))
 
 
 def _millivolts(s: Telemetry) -> int:
@@ -436,11 +450,9 @@ def _battery_status(s: Telemetry) -> Any:
 
 
 def _current_mode(s: Telemetry) -> Any:
-    return mavlink.MAVLink_current_mode_message(
-        STANDARD_MODE.get(s.commander.mode, 0),
-        s.commander.mode.custom_mode,
-        s.commander.user_mode.custom_mode,
-    )
+    mode, user_mode = s.commander.mode, s.commander.user_mode
+    values = (mode.custom_mode, user_mode.custom_mode, STANDARD_MODE.get(mode, 0))
+    return Fields(mavlink.MAVLink_current_mode_message, values)
 
 
 def _vibration(s: Telemetry) -> Any:

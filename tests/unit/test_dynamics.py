@@ -21,6 +21,7 @@ from sim.dynamics import (
     Setpoint,
     Vehicle,
     constrain_horizontal,
+    normals,
 )
 
 DT_S = 0.004
@@ -211,7 +212,7 @@ def test_vehicle_without_thrust_falls_to_the_ground_and_stays() -> None:
 
 
 def test_gust_has_its_sigma_and_time_constant_and_never_exceeds_its_bound() -> None:
-    gust = OrnsteinUhlenbeck(0.3, 1.0, DT_S, random.Random(3), bound=0.8)
+    gust = OrnsteinUhlenbeck(0.3, 1.0, DT_S, normals(random.Random(3)), bound=0.8)
     samples = []
     for _ in range(200_000):
         gust.step()
@@ -224,8 +225,13 @@ def test_gust_has_its_sigma_and_time_constant_and_never_exceeds_its_bound() -> N
     assert correlation == pytest.approx(math.exp(-1.0), abs=0.1)
 
 
+def test_normal_numbers_are_those_of_the_standard_library() -> None:
+    made, ours = random.Random("same"), normals(random.Random("same"))
+    assert [next(ours) for _ in range(1001)] == [made.gauss(0.0, 1.0) for _ in range(1001)]
+
+
 def test_gust_of_zero_sigma_is_calm() -> None:
-    gust = OrnsteinUhlenbeck(0.0, 1.0, DT_S, random.Random(3))
+    gust = OrnsteinUhlenbeck(0.0, 1.0, DT_S, normals(random.Random(3)))
     gust.step()
     assert (gust.north, gust.east, gust.down) == (0.0, 0.0, 0.0)
 

@@ -310,3 +310,25 @@ def test_every_mode_has_a_name_and_is_asked_for_by_its_numbers(mode: Px4Mode) ->
 
 def test_an_unknown_mode_is_named_by_its_number() -> None:
     assert mode_name(0x12340000) == "0x12340000"
+
+
+@pytest.mark.parametrize("message", [message for message, _ in HEARD], ids=lambda m: str(m.get_type()))
+def test_frames_are_packed_to_the_byte_as_pymavlink_packs_them(message: Any) -> None:
+    sender = autopilot()
+    for sequence in (0, 255):
+        sender.seq = sequence
+        assert wire.packed(message, sender) == packed(message, sender)
+
+
+@given(st.binary(max_size=255), st.sampled_from([32, 84, 245, 436]))
+def test_a_frames_fields_are_unpacked_as_pymavlink_unpacks_them(payload: bytes, message_id: int) -> None:
+    kind = dialect.mavlink_map[message_id]
+    datagram = resigned(message_id, kind.crc_extra, payload, (SYSTEM_ID, 1))
+    assert wire.whole_frame(datagram) == message_id
+    values = wire.unpacked(kind, datagram)
+    told = read(datagram)
+    assert values is not None
+    assert repr(values) == repr(tuple(getattr(told, name) for name in kind.ordered_fieldnames))
+    damaged = bytearray(datagram)
+    damaged[-1] ^= 1
+    assert wire.unpacked(kind, bytes(damaged)) is None
