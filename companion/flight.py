@@ -5,6 +5,7 @@ and passes the operator's commands on. Phases are `core.phase`'s, failsafes `cor
 """
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import dist, hypot
 
@@ -29,7 +30,6 @@ from companion.core.neighbours import PeerTable
 from companion.core.phase import PhaseEvent, next_phase
 from companion.core.plan import Programme, Reference
 from companion.core.rejoin import OwnWay
-from companion.core.safety import SafetyFilter
 from companion.core.values import (
     FILTERED_PHASES,
     FLYING_PHASES,
@@ -95,7 +95,8 @@ class Flight:
     autopilot: AutopilotClient
     programme: Programme
     peers: PeerTable
-    safety: SafetyFilter
+    restart_filter: Callable[[], None]
+    """the safety filter forgets what was flown before"""
     phase: Phase = Phase.IDLE
     failsafes: list[str] = field(default_factory=list)
     counts: Counter[str] = field(default_factory=Counter)
@@ -219,7 +220,7 @@ class Flight:
             return "no position"
         self._orders.release_ns = None
         self._orders.resume_ns = now.monotonic_ns
-        self.safety.reset()
+        self.restart_filter()
         return None
 
     def _end_resume(self, now: Instant) -> None:
@@ -256,7 +257,7 @@ class Flight:
         # A retry of what has happened would happen again: over the pilot's head, at worst.
         ap.withdraw("arming", "take-off", Px4Mode.OFFBOARD.name)
         if event in (PhaseEvent.ENGAGED, PhaseEvent.RESUMED):
-            self.safety.reset()
+            self.restart_filter()
             self.formation_since_ns = now.fleet_ns
             self._engages = event is PhaseEvent.ENGAGED
             self._alone_since_ns = self._first_jump_ns = None
@@ -411,7 +412,7 @@ class Flight:
         if positioned and not stopped and (self._mode_asked_ns or reached or loiters):
             if not self._mode_asked_ns:
                 self._mode_asked_ns = now.monotonic_ns
-                self.safety.reset()
+                self.restart_filter()
             elif now.monotonic_ns - self._mode_asked_ns > STREAM_BEFORE_NS:
                 ap.set_mode(Px4Mode.OFFBOARD)
         if self._critical.holds(self._battery_below(self.config.failsafe.battery_critical_percent), now.monotonic_ns):
@@ -487,7 +488,7 @@ class Flight:
         self._last_jump_ns = now.monotonic_ns
         self.counts[Failsafe.POSITION_JUMPED.value] += 1
         self.autopilot.doubt_origin()
-        self.safety.reset()
+        self.restart_filter()
         if self._first_jump_ns is None or not recent:
             self._first_jump_ns = now.monotonic_ns
             self._fail(Failsafe.POSITION_JUMPED, now)

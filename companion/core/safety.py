@@ -79,6 +79,8 @@ class HalfPlane(NamedTuple):
     g_east: float
     b: float
     """m/s^2 where |g| is 1; see above"""
+    vehicle_id: int = 0
+    """whose distance it keeps; 0: a wall's"""
     v_north: float = 0.0
     """velocity of the obstacle (m/s)"""
     v_east: float = 0.0
@@ -138,6 +140,7 @@ def half_plane(ego: VehicleState, shared_acceleration: Ned, neighbour: Neighbour
         *barrier(
             x, y, z, vx, vy, vz, d, neighbour.shares_avoidance, 0.5 * (s.north + t.north), 0.5 * (s.east + t.east)
         ),
+        neighbour.vehicle_id,
         v.north,
         v.east,
     )
@@ -394,7 +397,7 @@ class SafetyFilter:
     ) -> tuple[float, float]:  # fmt: skip
         """The command that keeps distances and fence, nearest to u, within the acceleration that avoidance may use."""
         most = self.limits.avoidance_acceleration_m_s2
-        rows = [list(p) for p in (*peers, *walls)]
+        rows = [[p.g_north, p.g_east, p.b, p.v_north, p.v_east] for p in (*peers, *walls)]
         kept = avoid(*u, v_north, v_east, rows, len(peers), len(rows), most, [[0.0] * 3 for _ in rows])
         if kept.peer:
             self._acted.add("peer distance")

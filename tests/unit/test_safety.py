@@ -132,8 +132,8 @@ def test_halves_of_a_pair_make_up_the_whole_barrier_whatever_the_plan_asks_of_ea
 )
 def test_the_barriers_poles_are_at_2_5_per_second(north: float, closing: float, b: float) -> None:
     """-(h'' + 5 h' + 6.25 h)/(2 r) of a peer that flies straight on, h = |x|^2 - (1 m)^2."""
-    plane = half_plane(state(), ZERO, peer(Ned(north, 0.0, 0.0), Ned(-closing, 0.0, 0.0)))
-    assert plane == pytest.approx((-1.0, 0.0, b / (2.0 * north), -closing, 0.0))
+    plane = half_plane(state(), ZERO, peer(Ned(north, 0.0, 0.0), Ned(-closing, 0.0, 0.0), vehicle_id=7))
+    assert plane == pytest.approx((-1.0, 0.0, b / (2.0 * north), 7, -closing, 0.0))
 
 
 def test_full_share_is_taken_toward_a_peer_that_does_not_avoid() -> None:
@@ -156,8 +156,8 @@ def test_a_half_plane_is_of_the_distances_acceleration_and_two_that_touch_do_not
 
 def test_a_half_plane_tells_the_obstacles_velocity() -> None:
     drifting = peer(Ned(3.0, -1.0, 0.0), Ned(0.0, 0.4, 0.3), other_end_ned_m=Ned(3.0, 1.0, 0.0))
-    assert half_plane(state(), ZERO, drifting)[3:] == pytest.approx((0.0, 0.2))
-    assert half_plane(state(), ZERO, peer(Ned(3.0, -1.0, 0.0), Ned(1.0, 0.4, 0.3)))[3:] == (1.0, 0.4)
+    assert half_plane(state(), ZERO, drifting)[4:] == pytest.approx((0.0, 0.2))
+    assert half_plane(state(), ZERO, peer(Ned(3.0, -1.0, 0.0), Ned(1.0, 0.4, 0.3)))[4:] == (1.0, 0.4)
 
 
 def test_toward_a_peer_that_shares_the_command_counts_from_the_mean_of_both_slots() -> None:
