@@ -17,7 +17,7 @@ from companion.core.estimate import BiasObserver, SendFilter
 from companion.core.events import Event, MotionAdopted
 from companion.core.failsafe import LATE_S, Failsafe
 from companion.core.frames import Ned, geodetic_to_ned
-from companion.core.law import finish, pair, separation, total
+from companion.core.law import Law, StarlingLaw
 from companion.core.neighbours import PeerTable, held
 from companion.core.plan import (
     PADS,
@@ -41,7 +41,6 @@ from companion.core.values import (
     FORMATION_PHASES,
     SETTLED_PHASES,
     ZERO,
-    Command,
     Instant,
     Neighbour,
     PeerMessage,
@@ -134,12 +133,13 @@ class Agent:
         self.programme = Programme([config.first_motion])
         others = frozenset(v.id for v in config.vehicles) - {vehicle_id}
         self.peers = PeerTable(vehicle_id, others, config.peer_limits, self.programme)
+        self.law: Law = StarlingLaw(config.gains)
+        """what is flown, before the filter; tests and studies may put another in its place"""
         self.safety = SafetyFilter(config.safety_limits)
-        self.flight = Flight(config, vehicle_id, self.autopilot, self.programme, self.peers, self.safety)
+        self.flight = Flight(config, vehicle_id, self.autopilot, self.programme, self.peers, self._restart_filter)
         self.orders = OrderBook()
         self.messages_sent = 0
         self.setpoints_sent = 0
-        self._gains = config.gains
         self._error_trigger = config.error_trigger
         self._switching_trigger = config.switching_trigger
         self._spacing = config.message_spacing
@@ -587,7 +587,7 @@ class Agent:
         residual = ZERO
         steered = False
         if steers:
-            command, residual = self._law(ego, reference, neighbours)
+            command, residual = self.law.command(ego, reference, neighbours, alone=self.flight.alone)
             setpoint = self.safety.apply(command, ego, neighbours, bias, dt_s)
             if setpoint is not None:
                 self._outputs.mavlink.append(self._encode(setpoint))
@@ -621,37 +621,9 @@ class Agent:
             f.step(p, v, u, dt_s)
         return VehicleState(now.fleet_ns, position, free), Ned(*(o.bias_m_s for o in self._bias))
 
-    def _law(self, ego: VehicleState, reference: Reference, neighbours: list[Neighbour]) -> tuple[Command, Ned]:
-        """The law's command and the mean residual to the neighbours in formation.
-
-        Altitude is flown by position, so the vertical errors are left out of the horizontal budget. Velocities are
-        compared as they differ from what the plan asks of each slot: slots that turn or change places have their own.
-        """
-        p, v, g = ego.position_ned_m, ego.velocity_ned_m_s, self._gains
-        r, rv, ra, yaw = reference
-        shares = []
-        apart = (0.0, 0.0)
-        for n in neighbours:
-            q, w, d = n.position_ned_m, n.velocity_ned_m_s, n.offset_ned_m
-            dx, dy, dz = p.north - q.north, p.east - q.east, p.down - q.down
-            if n.in_formation and not self.flight.alone:
-                s = n.reference_velocity_ned_m_s
-                dvx, dvy = v.north - w.north - (rv.north - s.north), v.east - w.east - (rv.east - s.east)
-                shares.append(pair(dx, dy, dz, dvx, dvy, 0.0, d.north, d.east, dz, g))
-            elif n.other_end_ned_m is None:
-                away = separation(dx, dy, dz, g)
-                apart = (apart[0] + away[0], apart[1] + away[1])
-        sums, count = total(shares), len(shares)
-        sums = sums._replace(sep_x=sums.sep_x + apart[0], sep_y=sums.sep_y + apart[1], sep_z=0.0)
-        u = finish(
-            count, sums,
-            p.north - r.north, p.east - r.east, 0.0,
-            v.north - rv.north, v.east - rv.east, 0.0,
-            ra.north, ra.east, 0.0,
-            g,
-        )  # fmt: skip
-        share = 1.0 / count if count else 0.0
-        return Command(Ned(*u), r, rv, ra, yaw), Ned(sums.res_x * share, sums.res_y * share, 0.0)
+    def _restart_filter(self) -> None:
+        """Whatever filter flies starts anew, as the vehicle does: it is the agent's, and nobody else holds it."""
+        self.safety.reset()
 
     def _encode(self, s: SafeSetpoint) -> bytes:
         frame = self.autopilot.frame

@@ -4,6 +4,7 @@ No I/O and no peers' bytes: `agent` asks it at each control tick where to be (`f
 and passes the operator's commands on. Phases are `core.phase`'s, failsafes `core.failsafe`'s.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import dist, hypot
 
@@ -30,7 +31,6 @@ from companion.core.neighbours import PeerTable
 from companion.core.phase import PhaseEvent, next_phase
 from companion.core.plan import Programme, Reference
 from companion.core.rejoin import OwnWay
-from companion.core.safety import SafetyFilter
 from companion.core.values import (
     FILTERED_PHASES,
     FLYING_PHASES,
@@ -102,7 +102,8 @@ class Flight:
     autopilot: AutopilotClient
     programme: Programme
     peers: PeerTable
-    safety: SafetyFilter
+    restart_filter: Callable[[], None]
+    """the safety filter forgets what was flown before"""
     phase: Phase = Phase.IDLE
     failsafes: list[str] = field(default_factory=list)
     counts: Counts = field(default_factory=lambda: Counts(failsafe.value for failsafe in Failsafe))
@@ -233,7 +234,7 @@ class Flight:
             return "no position"
         self._orders.release_ns = None
         self._orders.resume_ns = now.monotonic_ns
-        self.safety.reset()
+        self.restart_filter()
         return None
 
     def _end_resume(self, now: Instant) -> None:
@@ -275,7 +276,7 @@ class Flight:
         # A retry of what has happened would happen again: over the pilot's head, at worst.
         ap.withdraw("arming", "take-off", Px4Mode.OFFBOARD.name)
         if event in (PhaseEvent.ENGAGED, PhaseEvent.RESUMED):
-            self.safety.reset()
+            self.restart_filter()
             self.formation_since_ns = now.fleet_ns
             self._engages = event is PhaseEvent.ENGAGED
             self._alone_since_ns = self._first_jump_ns = None
@@ -448,7 +449,7 @@ class Flight:
         if positioned and not stopped and (self._mode_asked_ns or reached or loiters):
             if not self._mode_asked_ns:
                 self._mode_asked_ns = now.monotonic_ns
-                self.safety.reset()
+                self.restart_filter()
             elif now.monotonic_ns - self._mode_asked_ns > STREAM_BEFORE_NS:
                 ap.set_mode(Px4Mode.OFFBOARD)
         if self._critical.holds(self._battery_below(self.config.failsafe.battery_critical_percent), now.monotonic_ns):
@@ -524,7 +525,7 @@ class Flight:
         self._last_jump_ns = now.monotonic_ns
         self.counts[Failsafe.POSITION_JUMPED.value] += 1
         self.autopilot.doubt_origin()
-        self.safety.reset()
+        self.restart_filter()
         if self._first_jump_ns is None or not recent:
             self._first_jump_ns = now.monotonic_ns
             self._fail(Failsafe.POSITION_JUMPED, now)

@@ -18,7 +18,8 @@ import numpy as np
 import numpy.typing as npt
 from numba import config as numba_config
 
-from companion.core import consensus, estimate, hold, intent, law, neighbours, safety, trigger
+from companion.core import consensus, estimate, hold, intent, law, neighbours, program, safety, trigger, vectors
+from companion.core.frames import Ned
 from companion.core.hold import Weights
 from companion.core.intent import IntentGains, IntentTrigger
 from companion.core.law import Gains, Sums
@@ -31,7 +32,7 @@ Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.uint8]
 F = TypeVar("F", bound=Callable[..., Any])
 
-_MODULES = (baselines, consensus, estimate, hold, intent, law, neighbours, safety, trigger)
+_MODULES = (baselines, consensus, estimate, hold, intent, law, neighbours, program, safety, trigger, vectors)
 
 
 def source_hash() -> str:
@@ -76,8 +77,15 @@ switching_threshold = compiled(trigger.switching_threshold)
 switching_exceeds = compiled(trigger.switching_exceeds, switching_threshold=switching_threshold)
 alpha_beta = compiled(estimate.alpha_beta)
 barrier = compiled(safety.barrier)
-project: Callable[[float, float, Floats, Floats], tuple[float, float, bool]] = compiled(cast(Any, safety.project))
+on_edge = compiled(program.on_edge)
+best = compiled(program.best, on_edge=on_edge)
+give_way = compiled(program.give_way, best=best)
+solve = compiled(program.solve, best=best, give_way=give_way)
 sidestep = compiled(safety.sidestep)
+share_of_segment = compiled(vectors.share_of_segment)
+avoid: Callable[[float, float, float, float, Floats, int, int, float, Floats], safety.Avoidance] = compiled(
+    cast(Any, safety.avoid), sidestep=sidestep, solve=solve
+)
 is_outlier = compiled(neighbours.is_outlier)
 saturated = compiled(consensus.saturated)
 common_velocity_rate = compiled(consensus.common_velocity_rate)
@@ -233,8 +241,9 @@ class State(NamedTuple):
     keys: npt.NDArray[np.uint64]
     """(N, 8): each agent's own streams"""
     planes: Floats
-    """(N, most neighbours, 4) or (1, ...): scratch of the barrier"""
-    weights: Floats
+    """(most neighbours, 5): half-planes of the safety filter, with the velocity of each obstacle"""
+    spare: Floats
+    """(most neighbours, 3): room for its program"""
     scratch: Floats
     measures: Floats
     """see MEASURES"""
@@ -613,8 +622,6 @@ def command(k: int, s: State, ref: Floats, o: Options, g: Gains, ig: IntentGains
         gated = t >= o.gates_after
         mx, my = _gates(i, s, o) if gated else (0.0, 0.0)
         planes = 0
-        blocked = -1
-        deficit = 0.0
         for e in range(s.start[i], s.start[i + 1]):
             j = s.column[e]
             r = e if o.links == 1 else j
@@ -632,7 +639,10 @@ def command(k: int, s: State, ref: Floats, o: Options, g: Gains, ig: IntentGains
             px, py, pz = row[0], row[1], row[2]
             vx, vy, vz = row[3], row[4], row[5]
             if lost:
-                share = safety_share(s.measured[i], row, s.stopped[r])
+                share = share_of_segment(
+                    Ned(s.measured[i, 0], s.measured[i, 1], s.measured[i, 2]), Ned(px, py, pz),
+                    Ned(s.stopped[r, 0], s.stopped[r, 1], s.stopped[r, 2]), safety.DOWNWASH_RATIO,
+                )  # fmt: skip
                 px += share * (s.stopped[r, 0] - px)
                 py += share * (s.stopped[r, 1] - py)
                 pz += share * (s.stopped[r, 2] - pz)
@@ -726,35 +736,10 @@ def command(k: int, s: State, ref: Floats, o: Options, g: Gains, ig: IntentGains
             s.common[i, 1] += dt * ny
             s.common[i, 2] += dt * nz
         if o.barrier == 1:
-            for q_at in range(planes):
-                gn, ge, b = s.planes[q_at, 0], s.planes[q_at, 1], s.planes[q_at, 2]
-                short = (b - gn * u0 - ge * u1) / max(math.sqrt(gn * gn + ge * ge), 1e-6)
-                if short > 0.0 and (blocked < 0 or short > deficit):
-                    blocked, deficit = q_at, short
-            if blocked >= 0:
-                s.counts[4] += 1
-                u0, u1 = sidestep(
-                    u0, u1, s.planes[blocked, 0], s.planes[blocked, 1],
-                    s.measured[i, 3] - s.planes[blocked, 3], s.measured[i, 4] - s.planes[blocked, 4],
-                )  # fmt: skip
-                for q_at in range(planes):
-                    s.weights[q_at] = 0.0
-                u0, u1, _ = project(u0, u1, s.planes, s.weights[:planes])
-                size = math.sqrt(u0 * u0 + u1 * u1)
-                if size > o.avoidance_max:
-                    u0, u1 = u0 * o.avoidance_max / size, u1 * o.avoidance_max / size
+            kept = avoid(u0, u1, s.measured[i, 3], s.measured[i, 4], s.planes, planes, planes, o.avoidance_max, s.spare)
+            u0, u1 = kept.north, kept.east
+            s.counts[4] += 1 if kept.peer else 0
         s.u[i, 0], s.u[i, 1], s.u[i, 2] = u0, u1, u2
-
-
-@kernel
-def safety_share(q: Floats, a: Floats, b: Floats) -> float:
-    """How far from a toward b the segment comes nearest to q, in [0, 1]."""
-    length2 = 0.0
-    dot = 0.0
-    for c in range(3):
-        length2 += (b[c] - a[c]) ** 2
-        dot += (q[c] - a[c]) * (b[c] - a[c])
-    return min(max(dot / length2, 0.0), 1.0) if length2 > 1e-9 else 0.0
 
 
 @kernel
@@ -907,14 +892,12 @@ def law_fast(
 @kernel
 def barrier_fast(
     x: Floats, v: Floats, rows: Floats, start: Ints, column: Ints, near: float, radius: float, avoidance_max: float,
-    vd: Floats, planes: Floats, weights: Floats, u: Floats,
+    vd: Floats, planes: Floats, spare: Floats, u: Floats,
 ) -> int:  # fmt: skip
     """The safety filter for large swarms, over the neighbours within `near`; returns how many commands it changed."""
     changed = 0
     for i in range(x.shape[0]):
         count = 0
-        blocked = -1
-        deficit = 0.0
         for e in range(start[i], start[i + 1]):
             j = column[e]
             dx, dy, dz = x[i, 0] - rows[j, 0], x[i, 1] - rows[j, 1], x[i, 2] - rows[j, 2]
@@ -926,22 +909,10 @@ def barrier_fast(
             )  # fmt: skip
             planes[count, 0], planes[count, 1], planes[count, 2] = gn, ge, b
             planes[count, 3], planes[count, 4] = rows[j, 3], rows[j, 4]
-            short = (b - gn * u[i, 0] - ge * u[i, 1]) / max(math.sqrt(gn * gn + ge * ge), 1e-6)
-            if short > 0.0 and (blocked < 0 or short > deficit):
-                blocked, deficit = count, short
             count += 1
-        if blocked >= 0:
-            changed += 1
-            u0, u1 = sidestep(
-                u[i, 0], u[i, 1], planes[blocked, 0], planes[blocked, 1],
-                v[i, 0] - planes[blocked, 3], v[i, 1] - planes[blocked, 4],
-            )  # fmt: skip
-            for k in range(count):
-                weights[k] = 0.0
-            u0, u1, _ = project(u0, u1, planes, weights[:count])
-            size = max(math.sqrt(u0 * u0 + u1 * u1), 1e-9)
-            share = min(1.0, avoidance_max / size)
-            u[i, 0], u[i, 1] = share * u0, share * u1
+        kept = avoid(u[i, 0], u[i, 1], v[i, 0], v[i, 1], planes, count, count, avoidance_max, spare)
+        u[i, 0], u[i, 1] = kept.north, kept.east
+        changed += 1 if kept.peer else 0
     return changed
 
 

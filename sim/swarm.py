@@ -592,7 +592,7 @@ def run(setup: Setup, seed: int, *, reference: Floats | None = None, start: tupl
         ring_digest_step=np.zeros((depth, n if o.links else 1, ring_digest), dtype=np.int64),
         ring_digest_id=np.full((depth, n if o.links else 1, ring_digest), -1, dtype=np.int64),
         outage=np.zeros(rows, dtype=np.uint8), keys=agent_keys(seed, n), planes=np.zeros((width, 5)),
-        weights=np.zeros(width), scratch=np.zeros((2, width)),
+        spare=np.zeros((width, 3)), scratch=np.zeros((2, width)),
         measures=np.array([1e9, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]), events=np.zeros((most, 2), dtype=np.int64),
         counts=np.zeros(5, dtype=np.int64), record=np.zeros((kept, n, 6)), record_u=np.zeros((kept, n, 3)),
     )  # fmt: skip
@@ -612,7 +612,7 @@ def run(setup: Setup, seed: int, *, reference: Floats | None = None, start: tupl
             if near.update(s.x):
                 most_near = int(np.diff(near.start).max()) + 1
                 s = s._replace(start=near.start, column=near.column, planes=np.zeros((most_near, 5)),
-                               weights=np.zeros(most_near), scratch=np.zeros((2, most_near)))  # fmt: skip
+                               spare=np.zeros((most_near, 3)), scratch=np.zeros((2, most_near)))  # fmt: skip
             loops.advance(k, k + 1, setup.keep_every, s, table, o, g, ig, et, st, it)
     if s.counts[0] > most:
         raise RuntimeError(f"{s.counts[0]} events, room for {most}")

@@ -1,7 +1,8 @@
 """The starling law: separation, alignment and cohesion toward a desired formation.
 
-Two branch-free scalar functions on plain floats. A companion calls them as they are for each neighbour; a swarm study
-compiles the same two over neighbour lists. With the symbols of the paper (Mei, Duan: "Decentralized Cooperative
+A `Law` says what a vehicle flies, before the safety filter; a companion holds one and can be given another. The one
+that is flown, `StarlingLaw`, sums over the neighbours with two branch-free scalar functions on plain floats, which a
+swarm study compiles over neighbour lists. With the symbols of the paper (Mei, Duan: "Decentralized Cooperative
 Control of Unmanned Aerial Vehicles Based on Emergent Mechanism of Starlings"), its Eq. (2) reads
 
     u_i = k_s sum_j phi_s(r_ij) r^_ij - k_a sum_j (v_i - v^_j) - k_c sum_j ((p_i - p^_j) - d_ij)
@@ -21,11 +22,31 @@ brakes it to a standstill. `Gains` with `normalise = 0`, infinite saturations, `
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from math import fsum, inf, sqrt
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
+
+from companion.core.frames import Ned
+from companion.core.plan import Reference
+from companion.core.values import Command, Neighbour, VehicleState
 
 DISTANCE_FLOOR_M = 0.2
 """separation grows no further below this distance"""
+
+
+class Law(Protocol):
+    """What a vehicle flies toward its slot and among its neighbours; it keeps no distance by itself."""
+
+    def command(
+        self, ego: VehicleState, reference: Reference, neighbours: Sequence[Neighbour], *, alone: bool
+    ) -> tuple[Command, Ned]:
+        """The wanted command, and the mean residual p_i - p^_j - d_ij to the neighbours in formation (m), which the
+        trigger looks at.
+
+        `ego` is the own state, its velocity free of the estimator's bias; `reference` is what the plan asks of the own
+        slot. A vehicle that flies `alone` is not drawn by the formation.
+        """
+        ...
 
 
 class Gains(NamedTuple):
@@ -150,3 +171,45 @@ def total(shares: Sequence[Sums]) -> Sums:
 def paper_gains(k_s: float, k_a: float, k_c: float, r0: float) -> Gains:
     """Eq. (2) as printed, with the repulsive sign: plain sums, no saturation, no plan, no limit."""
     return Gains(k_s, k_a, k_c, 0.0, 0.0, r0, inf, inf, inf, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class StarlingLaw:
+    """The law that is flown; with `paper_gains` Eq. (2) of the paper."""
+
+    gains: Gains
+
+    def command(
+        self, ego: VehicleState, reference: Reference, neighbours: Sequence[Neighbour], *, alone: bool
+    ) -> tuple[Command, Ned]:
+        """See `Law`.
+
+        Altitude is flown by position, so the vertical errors are left out of the horizontal budget. Velocities are
+        compared as they differ from what the plan asks of each slot: slots that turn or change places have their own.
+        Whoever is not in formation, or is not known to be at one place, is kept apart from or left to the filter.
+        """
+        p, v, g = ego.position_ned_m, ego.velocity_ned_m_s, self.gains
+        r, rv, ra, yaw = reference
+        shares = []
+        apart = (0.0, 0.0)
+        for n in neighbours:
+            q, w, d = n.position_ned_m, n.velocity_ned_m_s, n.offset_ned_m
+            dx, dy, dz = p.north - q.north, p.east - q.east, p.down - q.down
+            if n.in_formation and not alone:
+                s = n.reference_velocity_ned_m_s
+                dvx, dvy = v.north - w.north - (rv.north - s.north), v.east - w.east - (rv.east - s.east)
+                shares.append(pair(dx, dy, dz, dvx, dvy, 0.0, d.north, d.east, dz, g))
+            elif n.other_end_ned_m is None:
+                away = separation(dx, dy, dz, g)
+                apart = (apart[0] + away[0], apart[1] + away[1])
+        sums, count = total(shares), len(shares)
+        sums = sums._replace(sep_x=sums.sep_x + apart[0], sep_y=sums.sep_y + apart[1], sep_z=0.0)
+        u = finish(
+            count, sums,
+            p.north - r.north, p.east - r.east, 0.0,
+            v.north - rv.north, v.east - rv.east, 0.0,
+            ra.north, ra.east, 0.0,
+            g,
+        )  # fmt: skip
+        share = 1.0 / count if count else 0.0
+        return Command(Ned(*u), r, rv, ra, yaw), Ned(sums.res_x * share, sums.res_y * share, 0.0)

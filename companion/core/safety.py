@@ -10,10 +10,11 @@ c = 2.5 (a multirotor's downwash), d the safety radius of the pair and both pole
     h = |x|^2 - d^2,      h'' + 5 h' + 6.25 h >= 0
 
 is a half-plane for the horizontal command u: g.u >= b. Altitude is flown by position, so u has no vertical part. Of a
-pair whose filters are both active each takes half; toward anybody else this vehicle takes all. The command nearest to
-the law's that satisfies every half-plane is a quadratic program in two unknowns; it is solved exactly, one plane after
-another, in at most n (n - 1)/2 steps. (Cyclic projections, 40 sweeps, missed a point that exists in 3 of 100 random
-sets of up to nine planes, and took five times as long at their worst.)
+pair whose filters are both active each takes half; toward anybody else this vehicle takes all. It is written divided by
+2 |x|, so that g is the part of the direction from the peer that is level, b an acceleration of the distance, and what
+is missing the acceleration at which the distance falls short: so a near peer's is compared with a far one's, and with a
+wall's, where not all can be kept. The command nearest to the law's that satisfies every half-plane and the acceleration
+limit is a small program, solved exactly in `core.program`.
 
 The fence's walls are half-planes of the same kind (`core.fence`). Altitude is limited where it is flown: the position
 sent stays between floor and ceiling, and the velocity sent ends there.
@@ -21,13 +22,14 @@ sent stays between floor and ceiling, and the velocity sent ends there.
 
 from collections.abc import MutableSequence, Sequence
 from dataclasses import dataclass, field
-from math import copysign, hypot, inf, isfinite, sqrt
+from math import copysign, hypot, isfinite, sqrt
 from typing import NamedTuple
 
 from companion.core.counts import Counts
 from companion.core.estimate import VelocityReference
 from companion.core.fence import Fence, braking_pole_per_s, wall_plane
 from companion.core.frames import Ned
+from companion.core.program import FLAT, solve
 from companion.core.values import Command, Neighbour, SafeSetpoint, VehicleState
 from companion.core.vectors import between, share_of_segment
 
@@ -36,15 +38,10 @@ DOWNWASH_RATIO = 2.5
 POLE_PER_S = 2.5
 COLLISION_DISTANCE_M = 0.5
 LAG_ALLOWANCE_M = 0.15
-RELAXATIONS = 10
-"""halvings in the search for what misses the least when not all can be met"""
 SPEED_APPROACH_PER_S = 2.0
 """how fast the speed may approach its limit: acceleration along the velocity per what is left"""
 SIDESTEP_SPEED_M_S = 0.6
 """speed along the obstacle at which a blocked vehicle passes it, on its right"""
-TOLERANCE_M2_S2 = 1e-3
-FENCE_ID = 0
-"""stands for the fence where a half-plane names a vehicle"""
 BIAS_MAX_M_S = 1.0
 """most of the estimator's velocity bias, per axis, that is put back into what is sent: PX4's is 0.15-0.25 m/s. It is
 added after the speed limit, so that no more than speed_max + 1.42 m/s is ever sent"""
@@ -52,6 +49,8 @@ ALTITUDE_APPROACH_PER_S = 1.0
 """how fast the vertical velocity sent may lead to floor or ceiling: per metre that is left"""
 FENCE_MISS_M_S2 = 0.01
 """from this on a fence that is not kept is counted"""
+ROUNDED_M_S2 = 1e-6
+"""less than this is missed by rounding only"""
 FAR_M = 1e6
 """a peer said to be farther than this is looked at in full, since its numbers may not be finite ones"""
 
@@ -79,7 +78,26 @@ class HalfPlane(NamedTuple):
     g_north: float
     g_east: float
     b: float
-    vehicle_id: int
+    """m/s^2 where |g| is 1; see above"""
+    vehicle_id: int = 0
+    """whose distance it keeps; 0: a wall's"""
+    v_north: float = 0.0
+    """velocity of the obstacle (m/s)"""
+    v_east: float = 0.0
+
+
+class Avoidance(NamedTuple):
+    """What becomes of a wanted command."""
+
+    north: float
+    east: float
+    peer: bool
+    """it came too near to a peer"""
+    wall: bool
+    """it came too near to a wall"""
+    peers_missed_m_s2: float
+    """by how much not even this command keeps the peers' half-planes"""
+    walls_missed_m_s2: float
 
 
 def safety_radius_m(neighbour_uncertainty_m: float) -> float:
@@ -123,6 +141,8 @@ def half_plane(ego: VehicleState, shared_acceleration: Ned, neighbour: Neighbour
             x, y, z, vx, vy, vz, d, neighbour.shares_avoidance, 0.5 * (s.north + t.north), 0.5 * (s.east + t.east)
         ),
         neighbour.vehicle_id,
+        v.north,
+        v.east,
     )
 
 
@@ -153,18 +173,21 @@ def barrier(
     drift = 2.0 * (vx * vx + vy * vy + vz * vz) + 2.0 * POLE_PER_S * h_rate + POLE_PER_S * POLE_PER_S * h
     g_north, g_east = 2.0 * x, 2.0 * y
     half = -0.5 * drift + g_north * shared_north + g_east * shared_east
-    return g_north, g_east, half if shared else -drift
+    # Two that touch already are not let outweigh all others.
+    size = 2.0 * max(sqrt(x * x + y * y + z * z), COLLISION_DISTANCE_M)
+    return g_north / size, g_east / size, (half if shared else -drift) / size
 
 
 def out_of_reach(ego: VehicleState, shared_acceleration: Ned, neighbour: Neighbour, most_m_s2: float) -> bool:
     """Whether every command up to `most_m_s2` satisfies the pair's half-plane, told from the distance alone.
 
     With r the distance (vertical lengths divided by c), w the relative speed, p the pole, d the safety radius, U the
-    largest command and S that of both slots' plan: |g| <= 2 r and h' >= -2 r w, so that
+    largest command and S that of both slots' plan: |g| <= 1 and h' >= -2 r w, so that
 
         p^2 (r^2 - d^2) - 4 p r w - k r >= 0,   k = 2 U, or 4 (U + S) where each of a pair takes half
 
-    is enough for g.u >= b. It holds for all r >= d + (4 p w + k)/p^2. A lost peer's line is always looked at in full.
+    is enough for 2 r g.u >= 2 r b. It holds for all r >= d + (4 p w + k)/p^2. A lost peer's line is always looked at in
+    full.
     """
     if neighbour.other_end_ned_m is not None:
         return False
@@ -181,46 +204,47 @@ def out_of_reach(ego: VehicleState, shared_acceleration: Ned, neighbour: Neighbo
     return reach * reach <= x * x + y * y + z * z < FAR_M * FAR_M
 
 
-def nearest_feasible(u_north: float, u_east: float, planes: Sequence[HalfPlane]) -> tuple[float, float, bool]:
-    """The command nearest to u within every half-plane and True; with False, some command, as there is none."""
-    return project(u_north, u_east, planes, [0.0] * len(planes))
+def avoid(
+    u_north: float, u_east: float, v_north: float, v_east: float, rows: Sequence[MutableSequence[float]], peers: int,
+    count: int, most: float, spare: Sequence[MutableSequence[float]],
+) -> Avoidance:  # fmt: skip
+    """The command nearest to u, |u| <= `most`, that keeps what the rows say, at the own velocity v (m/s).
 
-
-def project(
-    u_north: float, u_east: float, planes: Sequence[Sequence[float]], weights: MutableSequence[float]
-) -> tuple[float, float, bool]:
-    """`nearest_feasible` over rows (g_north, g_east, b, ...), as many as there are `weights`.
-
-    Exact: if the best point for the first k planes breaks plane k + 1, the best for k + 1 lies on that plane's edge,
-    and there it is the foot of u, moved no further than the first k planes ask.
+    Rows are those of half-planes, `peers` of peers before those of walls, `count` in all; they and `spare`, room for as
+    many, are used up. Where it is a peer that blocks u, u is moved along it first.
     """
-    north, east = u_north, u_east
-    met = True
-    for k in range(len(weights)):
-        g_n, g_e, b = planes[k][0], planes[k][1], planes[k][2]
-        if g_n * north + g_e * east >= b - TOLERANCE_M2_S2:
-            continue
-        norm = max(g_n * g_n + g_e * g_e, 1e-12)
-        step = (b - g_n * u_north - g_e * u_east) / norm
-        foot_n, foot_e = u_north + step * g_n, u_east + step * g_e
-        low, high = -inf, inf
-        for j in range(k):
-            h_n, h_e = planes[j][0], planes[j][1]
-            slope = h_e * g_n - h_n * g_e
-            missing = planes[j][2] - h_n * foot_n - h_e * foot_e
-            if slope > 1e-12:
-                low = max(low, missing / slope)
-            elif slope < -1e-12:
-                high = min(high, missing / slope)
-            elif missing > TOLERANCE_M2_S2:
-                met = False
-        if low > high + 1e-9:
-            met = False
-        along = min(max(0.0, low), high)
-        north, east = foot_n - along * g_e, foot_e + along * g_n
-        if not met:
-            break
-    return north, east, met
+    blocking, worst, wall = -1, 0.0, False
+    for k in range(count):
+        missing = rows[k][2] - rows[k][0] * u_north - rows[k][1] * u_east
+        if missing > 0.0 and k >= peers:
+            wall = True
+        elif missing > 0.0:
+            missing = missing / max(hypot(rows[k][0], rows[k][1]), FLAT)
+            if missing > worst:
+                blocking, worst = k, missing
+    peer = blocking >= 0
+    if not peer and not wall:
+        return Avoidance(u_north, u_east, False, False, 0.0, 0.0)
+    if peer:
+        row = rows[blocking]
+        u_north, u_east = sidestep(u_north, u_east, row[0], row[1], v_north - row[3], v_east - row[4])
+    s = solve(u_north, u_east, rows, peers, count, most, spare)
+    return Avoidance(s.north, s.east, peer, wall, s.peers_missed, s.others_missed)
+
+
+def sidestep(
+    u_north: float, u_east: float, g_north: float, g_east: float, v_north: float, v_east: float
+) -> tuple[float, float]:
+    """u with what moves it to the right along the plane that it violates most; v is the velocity relative to the
+    obstacle (m/s). A command that does not press against the obstacle stays as it is: without this, head-on pairs stop
+    for ever."""
+    size = max(hypot(g_north, g_east), FLAT)
+    n_north, n_east = g_north / size, g_east / size
+    pressing = -(u_north * n_north + u_east * n_east)
+    right_north, right_east = n_east, -n_north
+    sideways = v_north * right_north + v_east * right_east
+    push = min(max(pressing, 0.0), 1.0) * 1.5 * max(SIDESTEP_SPEED_M_S - sideways, 0.0)
+    return u_north + push * right_north, u_east + push * right_east
 
 
 ACTING = (
@@ -280,7 +304,6 @@ class SafetyFilter:
             planes = [half_plane(ego, shared, n) for n in neighbours if not out_of_reach(ego, shared, n, most)]
             known = [p for p in planes if isfinite(p.g_north + p.g_east + p.b)]
             unknown, planes = len(planes) - len(known), known
-        walls = self._walls(ego)
         if unknown:
             self._acted.add("peer not finite: braking")
             u = self._clipped(-v_north, -v_east)
@@ -289,7 +312,7 @@ class SafetyFilter:
         else:
             self._acted.add("command not finite: braking")
             u = self._clipped(-v_north, -v_east)
-        u = self._kept(u, planes, walls, ego, neighbours)
+        u = self._kept(u, v_north, v_east, planes, self._walls(ego))
         self.acceleration_m_s2 = u
         north, east = self.velocity_reference.step(u[0], u[1], v_north, v_east, dt_s)
         speed = hypot(north, east)
@@ -366,7 +389,7 @@ class SafetyFilter:
         return held, kept
 
     def _walls(self, ego: VehicleState) -> list[HalfPlane]:
-        """The fence's half-planes that some admissible command breaks."""
+        """The fence's half-planes."""
         limits = self.limits
         if limits.fence is None:
             return []
@@ -374,120 +397,25 @@ class SafetyFilter:
         if not limits.fence.contains(ego.position_ned_m):
             self._acted.add("outside the fence")
         pole = braking_pole_per_s(limits.speed_max_m_s, limits.avoidance_acceleration_m_s2)
-        planes = [
-            HalfPlane(*wall_plane(wall, v_north, v_east, pole), FENCE_ID) for wall in limits.fence.walls(north, east)
-        ]
-        return [p for p in planes if p.b > -limits.avoidance_acceleration_m_s2]
+        return [HalfPlane(*wall_plane(wall, v_north, v_east, pole)) for wall in limits.fence.walls(north, east)]
 
     def _kept(
-        self,
-        u: tuple[float, float],
-        peers: Sequence[HalfPlane],
+        self, u: tuple[float, float], v_north: float, v_east: float, peers: Sequence[HalfPlane],
         walls: Sequence[HalfPlane],
-        ego: VehicleState,
-        neighbours: Sequence[Neighbour],
-    ) -> tuple[float, float]:
+    ) -> tuple[float, float]:  # fmt: skip
         """The command that keeps distances and fence, nearest to u, within the acceleration that avoidance may use."""
-        blocking = [p for p in peers if _deficit_m_s2(p, u) > 0.0]
-        at_fence = any(_deficit_m_s2(w, u) > 0.0 for w in walls)
-        if not blocking and not at_fence:
-            return u
-        if at_fence:
-            self._acted.add("fence")
         most = self.limits.avoidance_acceleration_m_s2
-        # No admissible command comes near the others' edges.
-        peers = [p for p in peers if p.b > -most * hypot(p.g_north, p.g_east)]
-        if blocking:
+        rows = [[p.g_north, p.g_east, p.b, p.v_north, p.v_east] for p in (*peers, *walls)]
+        kept = avoid(*u, v_north, v_east, rows, len(peers), len(rows), most, [[0.0] * 3 for _ in rows])
+        if kept.peer:
             self._acted.add("peer distance")
-            u = _sidestep(u, max(blocking, key=lambda p: _deficit_m_s2(p, u)), ego, neighbours)
-        planes = [*peers, *walls]
-        north, east, met = nearest_feasible(u[0], u[1], planes)
-        if met and hypot(north, east) <= most:
-            return north, east
-        gentlest = nearest_feasible(0.0, 0.0, planes)
-        if gentlest[2] and hypot(gentlest[0], gentlest[1]) <= most:
-            if not met:
-                # Edges that miss a common point by less than the tolerance: found from zero, not from u.
-                return gentlest[0], gentlest[1]
-            # What lies between two commands that keep everything keeps it too.
-            self._acted.add("acceleration")
-            return _within(gentlest[0], gentlest[1], north, east, most)
-        north, east, met = nearest_feasible(0.0, 0.0, peers)
-        kept = peers
-        if not met or hypot(north, east) > most:
+        if kept.wall:
+            self._acted.add("fence")
+        if kept.peers_missed_m_s2 > ROUNDED_M_S2:
             self._acted.add("peer distance not attainable")
-            north, east = _least_missing(peers, most)
-            miss = max(p.b - p.g_north * north - p.g_east * east for p in peers)
-            kept = [p._replace(b=p.b - max(miss, 0.0)) for p in peers]
-        if not walls:
-            return north, east
-        north, east = _least_missing(walls, most, kept, (north, east))
-        if any(_deficit_m_s2(w, (north, east)) > FENCE_MISS_M_S2 for w in walls):
+        if kept.walls_missed_m_s2 > FENCE_MISS_M_S2:
             self._acted.add("fence not attainable")
-        return north, east
-
-
-def _deficit_m_s2(plane: HalfPlane, u: tuple[float, float]) -> float:
-    """How far u is outside a half-plane (m/s^2); negative inside."""
-    g_north, g_east, b, _ = plane
-    return (b - g_north * u[0] - g_east * u[1]) / max(hypot(g_north, g_east), 1e-6)
-
-
-def _within(a_north: float, a_east: float, b_north: float, b_east: float, most: float) -> tuple[float, float]:
-    """The last point on the way from a, |a| <= most, to b with a norm of at most `most`."""
-    d_north, d_east = b_north - a_north, b_east - a_east
-    dd = max(d_north * d_north + d_east * d_east, 1e-12)
-    ad = a_north * d_north + a_east * d_east
-    rest = max(most * most - a_north * a_north - a_east * a_east, 0.0)
-    share = min(max((sqrt(ad * ad + dd * rest) - ad) / dd, 0.0), 1.0)
-    return a_north + share * d_north, a_east + share * d_east
-
-
-def _least_missing(
-    planes: Sequence[HalfPlane],
-    most: float,
-    kept: Sequence[HalfPlane] = (),
-    start: tuple[float, float] = (0.0, 0.0),
-) -> tuple[float, float]:
-    """The command with norm up to `most` (m/s^2) that misses the half-planes least, by the largest miss of h'' + ...
-
-    It stays within the half-planes `kept`, as the command `start` does.
-    """
-    u = start
-    weights = [0.0] * (len(kept) + len(planes))
-    low, high = 0.0, max(p.b - p.g_north * u[0] - p.g_east * u[1] for p in planes)
-    for _ in range(RELAXATIONS if high > 0.0 else 0):
-        relaxed = 0.5 * (low + high)
-        rows = [*kept, *(p._replace(b=p.b - relaxed) for p in planes)]
-        north, east, met = project(0.0, 0.0, rows, weights)
-        if met and hypot(north, east) <= most:
-            u, high = (north, east), relaxed
-        else:
-            low = relaxed
-    return u
-
-
-def _sidestep(
-    u: tuple[float, float], plane: HalfPlane, ego: VehicleState, neighbours: Sequence[Neighbour]
-) -> tuple[float, float]:
-    """Add what moves a blocked vehicle along the obstacle, to its right; without it, head-on pairs stop for ever."""
-    neighbour = next(n for n in neighbours if n.vehicle_id == plane.vehicle_id)
-    _, velocity = nearest_hypothesis(ego.position_ned_m, neighbour)
-    return sidestep(
-        u[0], u[1], plane.g_north, plane.g_east,
-        ego.velocity_ned_m_s.north - velocity.north, ego.velocity_ned_m_s.east - velocity.east,
-    )  # fmt: skip
-
-
-def sidestep(
-    u_north: float, u_east: float, g_north: float, g_east: float, v_north: float, v_east: float
-) -> tuple[float, float]:
-    """u with what moves it to the right along the plane that it violates most; v is the velocity relative to the
-    obstacle (m/s). A command that does not press against the obstacle stays as it is."""
-    size = max(hypot(g_north, g_east), 1e-6)
-    n_north, n_east = g_north / size, g_east / size
-    pressing = -(u_north * n_north + u_east * n_east)
-    right_north, right_east = n_east, -n_north
-    sideways = v_north * right_north + v_east * right_east
-    push = min(max(pressing, 0.0), 1.0) * 1.5 * max(SIDESTEP_SPEED_M_S - sideways, 0.0)
-    return u_north + push * right_north, u_east + push * right_east
+        attained = max(kept.peers_missed_m_s2, kept.walls_missed_m_s2) <= ROUNDED_M_S2
+        if (kept.peer or kept.wall) and attained and hypot(kept.north, kept.east) > most - ROUNDED_M_S2:
+            self._acted.add("acceleration")
+        return kept.north, kept.east

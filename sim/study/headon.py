@@ -1,7 +1,7 @@
 """Head-on by a broken law: what distance the safety filter keeps over lag, delay and loss, and where safety ends.
 
 The vehicles are the real thing: two agents with their event-triggered messages, on stub autopilots in lockstep. Only
-what the law says is replaced, just before the filter, by a command that flies at the other vehicle.
+the law is replaced, by one that flies at the other vehicle.
 """
 
 from collections.abc import Sequence
@@ -83,7 +83,7 @@ def meet(meeting: Meeting, seed: int, *, lag_s: float, delay_s: float, loss: flo
     fleet = Lockstep(config, seed=seed, network=NetworkParameters(delay_s=delay_s, loss=loss))
     laws = {}
     for i, v in fleet.vehicles.items():
-        v.agent.safety = laws[i] = BrokenLaw(config.safety_limits)
+        v.agent.law = laws[i] = BrokenLaw(v.agent.law)
     fleet.run_until(READY_S, lambda: not any(v.agent.unready(fleet.now) for v in fleet.vehicles.values()))
     fleet.command(b'{"verb":"takeoff"}')
     fleet.run_until(fleet.now_ns * 1e-9 + CLIMB_S, lambda: fleet.all_in(Phase.WAITING))
@@ -104,7 +104,7 @@ def meet(meeting: Meeting, seed: int, *, lag_s: float, delay_s: float, loss: flo
         "minimum_distance_m": float(np.linalg.norm(met[:, 0] - met[:, 1], axis=1).min()),
         "passed": passed(),
         "messages": len(fleet.sent) - sent,
-        "not_attainable": sum(law.counts["peer distance not attainable"] for law in laws.values()),
+        "not_attainable": sum(v.agent.safety.counts["peer distance not attainable"] for v in fleet.vehicles.values()),
     }
 
 

@@ -46,7 +46,7 @@ def step_costs(setup: Setup, seed: int, steps: int, relative_speed_m_s: float) -
     keys = swarm.agent_keys(seed, n)
     g, et = swarm.gains(setup), ErrorTrigger(setup.epsilon_m, setup.gamma_s2, setup.kappa)
     ig = IntentGains(1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
-    planes, weights = np.zeros((512, 5)), np.zeros(512)
+    planes, spare = np.zeros((512, 5)), np.zeros((512, 3))
     whole, barriers, rebuilds, messages = [], [], 0, 0
     turn = round(2.0 / setup.dt_s)
     for k in range(steps + 5):
@@ -61,7 +61,7 @@ def step_costs(setup: Setup, seed: int, steps: int, relative_speed_m_s: float) -
         loops.law_fast(x, v, rows, slot, near.start, near.column, setup.range_m**2, table[at, 0], g, u, residual)
         middle = time.thread_time_ns()
         loops.barrier_fast(x, v, rows, near.start, near.column, 5.0, setup.barrier_radius_m,
-                           setup.avoidance_max_m_s2, table[at, 0], planes, weights, u)  # fmt: skip
+                           setup.avoidance_max_m_s2, table[at, 0], planes, spare, u)  # fmt: skip
         end = time.thread_time_ns()
         x += setup.dt_s * v
         if k >= 5:

@@ -425,7 +425,7 @@ def test_the_plan_begins_although_a_slot_cannot_be_reached(stopped: tuple[int, .
     ls = launch(fleet(3, legs=straight(4.0), change=brief), seed=4)
     for i in stopped:
         agent = ls.vehicles[i].agent
-        agent.safety = BrokenLaw(agent.config.safety_limits, velocity_ned_m_s=Ned(0.0, 0.0, 0.0))
+        agent.law = BrokenLaw(agent.law, Ned(0.0, 0.0, 0.0))
     until(ls, 20.0, lambda: any(v.agent.programme.newest.revision == 1 for v in ls.vehicles.values()))
     formed = ls.vehicles[1].agent.programme.newest
     until(ls, 40.0, lambda: any(v.agent.programme.newest.legs for v in ls.vehicles.values()))

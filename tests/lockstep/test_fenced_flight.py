@@ -48,7 +48,7 @@ def test_a_broken_law_at_the_speed_limit_stays_inside_and_without_the_fence_it_l
     ls = fenced(1, fence=fence, lag_s=0.3, automatic=False)
     until(ls, 30.0, lambda: ls.all_in(Phase.WAITING))
     agent = ls.vehicles[1].agent
-    broken = agent.safety = BrokenLaw(agent.config.safety_limits)
+    broken = agent.law = BrokenLaw(agent.law)
     start_s = ls.now_ns * 1e-9
     broken.velocity_ned_m_s = Ned(4.0, 0.0, 0.0)
     wait(ls, 20.0)

@@ -11,8 +11,10 @@ import pytest
 from flights import fleet, parse, until, wait
 
 from companion.core.frames import Ned
+from companion.core.law import Law
+from companion.core.plan import Reference
 from companion.core.safety import SafetyFilter
-from companion.core.values import Command, Instant, Neighbour, Phase, SafeSetpoint, VehicleState
+from companion.core.values import FILTERED_PHASES, Command, Instant, Neighbour, Phase, VehicleState
 from sim.lockstep import Lockstep
 from sim.px4.faults import Fault, FaultKind
 
@@ -65,23 +67,18 @@ LIMITS = {
 
 
 @dataclass(slots=True)
-class AskedFor(SafetyFilter):
-    """The real filter, given something else than the law's command."""
+class AskedFor:
+    """A law whose command is replaced by what is asked for."""
 
+    sound: Law
     limit: Limit | None = None
     asked: float = 0.0
 
-    def apply(
-        self,
-        command: Command,
-        ego: VehicleState,
-        neighbours: Sequence[Neighbour],
-        velocity_bias_ned_m_s: Ned,
-        dt_s: float,
-    ) -> SafeSetpoint | None:
-        if self.limit is not None:
-            command = self.limit.ask(command, ego, self.asked)
-        return SafetyFilter.apply(self, command, ego, neighbours, velocity_bias_ned_m_s, dt_s)
+    def command(
+        self, ego: VehicleState, reference: Reference, neighbours: Sequence[Neighbour], *, alone: bool
+    ) -> tuple[Command, Ned]:
+        command, residual = self.sound.command(ego, reference, neighbours, alone=alone)
+        return command if self.limit is None else self.limit.ask(command, ego, self.asked), residual
 
 
 class Flown:
@@ -100,7 +97,7 @@ class Flown:
         self.sent: list[tuple[float, Any]] = []
         self.ls = Lockstep(fleet(1, altitude_m=ALTITUDE_M, change=change), seed=3, record=self.record)
         self.agent = self.ls.vehicles[1].agent
-        self.filter = self.agent.safety = AskedFor(self.agent.config.safety_limits)
+        self.law = self.agent.law = AskedFor(self.agent.law)
         self.ls.run_until(20.0, lambda: not self.agent.unready(self.ls.now))
 
     def record(self, i: int, channel: str, now: Instant, body: bytes) -> None:
@@ -108,7 +105,7 @@ class Flown:
             self.sent.append((now.monotonic_ns * 1e-9, parse(body)))
 
     def asks(self, limit: Limit | None, value: float = 0.0) -> None:
-        self.filter.limit, self.filter.asked = limit, value
+        self.law.limit, self.law.asked = limit, value
 
     def silent(self, seconds: float) -> None:
         """The autopilot sends nothing for a while."""
@@ -154,3 +151,37 @@ def test_what_is_sent_is_within_the_limit_and_nothing_is_sent_disarmed_or_withou
     flown.silent(0.9)
     wait(flown.ls, 0.55)
     assert flown.during(0.3) == [], "armed, positions stale"
+
+
+# -- one filter --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(slots=True)
+class Watched(SafetyFilter):
+    """The real filter, which tells how often it started anew."""
+
+    started: int = 0
+
+    def reset(self) -> None:
+        self.started += 1
+        SafetyFilter.reset(self)
+
+
+def test_the_filter_that_flies_is_the_one_that_starts_anew_whatever_is_put_in_its_place() -> None:
+    """Before it is let into OFFBOARD, on engaging, when it is resumed and when it then engages."""
+    flown = Flown()
+    agent, ls = flown.agent, flown.ls
+    watched = agent.safety = Watched(agent.config.safety_limits, acceleration_m_s2=(5.0, -5.0))
+    ls.command(b'{"verb":"takeoff"}')
+    until(ls, 20.0, lambda: agent.phase is Phase.CLIMBING and agent.flight.steers)
+    assert watched.started == 1
+    assert abs(watched.acceleration_m_s2[0]) < 1.0, "what was flown before is forgotten"
+    until(ls, 20.0, lambda: agent.phase is Phase.WAITING)
+    assert watched.started == 2
+    other = agent.safety = Watched(agent.config.safety_limits)
+    ls.command(b'{"verb":"release"}')
+    wait(ls, 3.0)
+    assert agent.phase is Phase.RELEASED
+    ls.command(b'{"verb":"resume"}')
+    until(ls, 10.0, lambda: agent.phase in FILTERED_PHASES)
+    assert (watched.started, other.started) == (2, 2)

@@ -1,4 +1,4 @@
-"""Mutants of the safety filter and of the phases: each must fail a test, or stand explained in survivors.toml.
+"""Mutants of the safety filter, its program and the phases: each must fail a test or stand explained in survivors.toml.
 
 mutmut changes what is inside functions; what is outside of them (constants, defaults, the table of transitions) is
 changed here. All of it happens in a copy, in a temporary directory.
@@ -25,8 +25,14 @@ import typer
 
 ROOT = Path(__file__).resolve().parents[2]
 EXPLAINED = Path(__file__).with_name("survivors.toml")
-SOURCES = ("companion/core/safety.py", "companion/core/phase.py")
-TESTS = ("tests/unit/test_safety.py", "tests/unit/test_fence.py", "tests/unit/test_phase.py")
+FILTER_TESTS = ("tests/unit/test_program.py", "tests/unit/test_safety.py", "tests/unit/test_fence.py")
+SOURCES = {
+    "companion/core/safety.py": FILTER_TESTS,
+    "companion/core/program.py": FILTER_TESTS,
+    "companion/core/phase.py": ("tests/unit/test_phase.py",),
+}
+"""what is changed, and the tests of which one must fail then"""
+TESTS = tuple(dict.fromkeys(test for tests in SOURCES.values() for test in tests))
 FLIGHTS = (
     "test_safety.py::test_two_sent_head_on", "test_safety.py::test_the_same_two_collide",
     "test_safety.py::test_one_avoids_alone", "test_safety.py::test_a_follower_passes",
@@ -182,7 +188,7 @@ def passes(copy: Path, path: str) -> bool:
         sys.path.insert(0, str(copy))
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         os.dup2(1, 2)
-        os._exit(pytest.main(["-x", *PYTEST_ARGUMENTS, *(TESTS if "safety" in path else TESTS[-1:])]))
+        os._exit(pytest.main(["-x", *PYTEST_ARGUMENTS, *SOURCES[path]]))
     try:
         return os.waitpid(pid, 0)[1] == 0
     except BaseException:
@@ -223,10 +229,10 @@ def explained() -> dict[str, str]:
 
 
 def main(
-    names: Annotated[list[str] | None, typer.Argument(help="mutmut's names (*project*): only these.")] = None,
+    names: Annotated[list[str] | None, typer.Argument(help="mutmut's names (*on_edge*): only these.")] = None,
     jobs: Annotated[int, typer.Option(min=1, help="mutants at a time.")] = 1,
 ) -> None:
-    """Change companion/core/safety.py and phase.py, one place at a time, and see that a unit test fails each time.
+    """Change the SOURCES, one place at a time, and see that a unit test fails each time.
 
     Exit status 0 if every mutant was killed or stands explained in survivors.toml, and everything there survived.
     """

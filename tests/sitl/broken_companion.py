@@ -17,7 +17,7 @@ def main() -> int:
     file, vehicle_id, speed_m_s = Path(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3])
     config = load(file)
     companion = Companion(config, RunSettings(vehicle_id, stop_fd=sys.stdin.fileno()), {})
-    broken = companion.agent.safety = BrokenLaw(config.safety_limits)
+    broken = companion.agent.law = BrokenLaw(companion.agent.law)
 
     def break_law(*_: object) -> None:
         broken.velocity_ned_m_s = Ned(speed_m_s, 0.0, 0.0)

@@ -12,9 +12,11 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from companion.core.frames import Ned
 from companion.core.law import (
     NO_SUMS,
     Gains,
+    StarlingLaw,
     Sums,
     finish,
     pair,
@@ -23,6 +25,9 @@ from companion.core.law import (
     total,
     within_budget,
 )
+from companion.core.plan import Reference
+from companion.core.values import Neighbour, VehicleState
+from sim.broken_law import GAIN_PER_S, PUSH_MAX_M_S2, BrokenLaw
 
 PROPERTY = settings(deadline=None, max_examples=40)
 FLIGHT = Gains(3.0, 3.0, 4.0, 1.0, 0.3, 2.0, 5.0, 1.0, 1.0, 1.0)
@@ -272,3 +277,76 @@ def test_the_crowd_does_not_make_the_law_stiffer(n: int) -> None:
 def test_the_default_budget_is_on_the_norm_and_not_on_the_axes() -> None:
     u = finish(0.0, NO_SUMS, 0.0, 0.0, 0.0, -10.0, -10.0, -10.0, 0.0, 0.0, 0.0, FLIGHT)
     assert sqrt(sum(x * x for x in u)) == pytest.approx(5.0)
+
+
+# -- the law as an object --------------------------------------------------------------------------------------------
+
+levels = st.builds(Ned, *[st.floats(-6.0, 6.0)] * 3)
+egos = st.builds(VehicleState, st.just(0), levels, levels)
+references = st.builds(Reference, levels, levels, levels, st.floats(-pi, pi))
+
+
+@st.composite
+def surroundings(draw: st.DrawFn) -> list[Neighbour]:
+    """Peers in and out of formation, lost ones, each at its own slot."""
+    return [
+        Neighbour(
+            k + 2, draw(levels), draw(levels), draw(levels), 0.1, draw(st.booleans()), draw(st.booleans()), 0.35,
+            draw(st.none() | levels), draw(levels),
+        )
+        for k in range(draw(st.integers(0, 5)))
+    ]  # fmt: skip
+
+
+def flat(x: Ned) -> Vector:
+    return np.array([x.north, x.east, 0.0])
+
+
+@settings(deadline=None, max_examples=150)
+@given(egos, references, surroundings(), st.booleans())
+def test_the_law_that_is_flown_is_its_formulas_in_the_level_plane(
+    ego: VehicleState, reference: Reference, neighbours: list[Neighbour], alone: bool
+) -> None:
+    """Distances count in space, all else on the level: altitude is flown by position."""
+    g = FLIGHT
+    u_sep, alignment, cohesion, residuals = np.zeros(3), np.zeros(3), np.zeros(3), []
+    for n in neighbours:
+        formed = n.in_formation and not alone
+        if formed or n.other_end_ned_m is None:
+            x = np.array(ego.position_ned_m) - np.array(n.position_ned_m)
+            r = max(float(np.linalg.norm(x)), 0.2)
+            u_sep += g.k_s * max(1 / r**2 - 1 / g.r0**2, 0.0) * flat(Ned(*x)) / r
+        if formed:
+            asked = flat(reference.velocity_ned_m_s) - flat(n.reference_velocity_ned_m_s)
+            alignment += saturated(flat(ego.velocity_ned_m_s) - flat(n.velocity_ned_m_s) - asked, 1.0)
+            residuals.append(flat(ego.position_ned_m) - flat(n.position_ned_m) - flat(n.offset_ned_m))
+            cohesion += saturated(residuals[-1], 1.0)
+    count = len(residuals)
+    off = flat(ego.position_ned_m) - flat(reference.position_ned_m)
+    mean = off - np.sum(residuals, axis=0) / (count + 1) if residuals else off
+    rest = (
+        -(g.k_a * alignment + g.k_c * cohesion) / max(count, 1)
+        - g.k_v * (flat(ego.velocity_ned_m_s) - flat(reference.velocity_ned_m_s))
+        + flat(reference.acceleration_ned_m_s2)
+        - g.k_p * saturated(mean, 1.0)
+    )
+    command, residual = StarlingLaw(g).command(ego, reference, neighbours, alone=alone)
+    assert command.acceleration_ned_m_s2 == pytest.approx(within_budget(*u_sep, *rest, g.a_max), abs=1e-6)
+    assert residual == pytest.approx(np.mean(residuals, axis=0) if residuals else np.zeros(3))
+    assert command[1:] == tuple(reference)
+
+
+@given(egos, references, surroundings(), levels)
+@PROPERTY
+def test_a_law_that_breaks_flies_at_its_velocity_and_speaks_as_before(
+    ego: VehicleState, reference: Reference, neighbours: list[Neighbour], velocity: Ned
+) -> None:
+    sound = StarlingLaw(FLIGHT)
+    broken = BrokenLaw(sound)
+    whole = sound.command(ego, reference, neighbours, alone=False)
+    assert broken.command(ego, reference, neighbours, alone=False) == whole
+    broken.velocity_ned_m_s = velocity
+    command, residual = broken.command(ego, reference, neighbours, alone=False)
+    wanted = GAIN_PER_S * (flat(velocity) - flat(ego.velocity_ned_m_s))
+    assert command.acceleration_ned_m_s2 == pytest.approx(saturated(wanted, PUSH_MAX_M_S2))
+    assert (command[1:], residual) == (whole[0][1:], whole[1])
