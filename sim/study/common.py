@@ -37,7 +37,7 @@ FLYING_CODE = tuple(
 """everything that flies in those: their finished seeds are run anew when any of it changes"""
 
 # Payloads as `companion.wire.peer` lays them out (bytes); the published intent carries c, g, w, e, e' instead of p, v.
-MESSAGE_BYTES = 57
+MESSAGE_BYTES = 59
 DIGEST_ENTRY_BYTES = 38
 INTENT_EXTRA_BYTES = 36
 

@@ -7,9 +7,9 @@ what the law says is replaced, just before the filter, by a command that flies a
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
-from math import dist
+from math import dist, inf
 from random import Random
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -37,6 +37,10 @@ SCATTER_M = 0.05
 """how far the two pads' lines lie apart at most"""
 
 
+Near = Literal["10 Hz", "20 Hz", "off"]
+"""near mode as it is flown, at twice its rate, and without it"""
+
+
 @dataclass(frozen=True, slots=True)
 class Meeting:
     """What is the same in every meeting."""
@@ -56,13 +60,14 @@ def meeting_of(config: Config) -> Meeting:
     return table_of(config, "meeting", Meeting)
 
 
-def _fleet(meeting: Meeting, lag_s: float, barrier: bool, aside_m: float) -> FleetConfig:
+def _fleet(meeting: Meeting, lag_s: float, barrier: bool, near: Near, aside_m: float) -> FleetConfig:
     half = 0.5 * meeting.apart_m
     return parse(
         {
             "fleet": {"name": "headon", "frame": "local"},
             "formation": {"altitude_m": meeting.altitude_m},
             "plan": {"automatic": False},
+            "trigger": {"near_period_s": 0.05 if near == "20 Hz" else 0.1},
             "limits": {
                 "barrier": barrier, "position_noise_m": meeting.noise_m, "velocity_noise_m_s": meeting.noise_m,
                 "gust_m_s2": meeting.gust_m_s2,
@@ -77,12 +82,17 @@ def _fleet(meeting: Meeting, lag_s: float, barrier: bool, aside_m: float) -> Fle
     )  # fmt: skip
 
 
-def meet(meeting: Meeting, seed: int, *, lag_s: float, delay_s: float, loss: float, barrier: bool = True) -> Record:
+def meet(
+    meeting: Meeting, seed: int, *, lag_s: float, delay_s: float, loss: float, barrier: bool = True,
+    near: Near = "10 Hz",
+) -> Record:  # fmt: skip
     """Fly one meeting; the smallest true distance of the two (m), and what it took."""
-    config = _fleet(meeting, lag_s, barrier, Random(f"headon/{seed}").uniform(-SCATTER_M, SCATTER_M))
+    config = _fleet(meeting, lag_s, barrier, near, Random(f"headon/{seed}").uniform(-SCATTER_M, SCATTER_M))
     fleet = Lockstep(config, seed=seed, network=NetworkParameters(delay_s=delay_s, loss=loss))
     laws = {}
     for i, v in fleet.vehicles.items():
+        if near == "off":
+            v.agent.near.push_m_s2 = -inf
         v.agent.safety = laws[i] = BrokenLaw(config.safety_limits)
     fleet.run_until(READY_S, lambda: not any(v.agent.unready(fleet.now) for v in fleet.vehicles.values()))
     fleet.command(b'{"verb":"takeoff"}')
@@ -104,6 +114,9 @@ def meet(meeting: Meeting, seed: int, *, lag_s: float, delay_s: float, loss: flo
         "minimum_distance_m": float(np.linalg.norm(met[:, 0] - met[:, 1], axis=1).min()),
         "passed": passed(),
         "messages": len(fleet.sent) - sent,
+        "bound_looks": fleet.near_bound.looks,
+        "bound_exceeded": fleet.near_bound.exceeded,
+        "bound_worst": fleet.near_bound.worst,
         "not_attainable": sum(law.counts["peer distance not attainable"] for law in laws.values()),
     }
 
