@@ -18,7 +18,7 @@ from companion.core.estimate import BiasObserver, SendFilter
 from companion.core.failsafe import LATE_S, Failsafe
 from companion.core.frames import Ned, geodetic_to_ned
 from companion.core.law import finish, pair, separation, total
-from companion.core.near import NearMode
+from companion.core.near import PUSH_M_S2, NearMode, near_push_m_s2
 from companion.core.neighbours import PeerTable, held
 from companion.core.plan import (
     PADS,
@@ -140,13 +140,15 @@ class Agent:
         self.flight = Flight(config, vehicle_id, self.autopilot, self.programme, self.peers, self.safety)
         self.orders = OrderBook()
         self.trigger = config.trigger_rule
-        self.near = NearMode(config.near_push_m_s2, config.near_rate)
+        self.near = NearMode(config.near_rate)
         self.messages_sent = 0
         self.sent_because: Counter[str] = Counter(dict.fromkeys(CAUSES, 0))
         """how many state messages were sent for which of CAUSES"""
         self.setpoints_sent = 0
         self._gains = config.gains
         self._spacing = config.message_spacing
+        self._slots_m = (config.spacing_min_m, config.safety_radius_m)
+        """the least distance of two slots, and the safety radius"""
         self._timer_ns = round(TIMER_SLACK * 1e9 / config.limits.control_rate_hz)
         self._random = Random(vehicle_id << 32 | boot_id)
         self._bias = (BiasObserver(), BiasObserver(), BiasObserver())
@@ -591,7 +593,7 @@ class Agent:
                 self._outputs.mavlink.append(self._encode(setpoint))
                 self.setpoints_sent += 1
                 steered = True
-            self._look_near(neighbours, now)
+            self._look_near(reference.velocity_ned_m_s, now)
         self.flight.settle(ego, reference, now)
         self._propose(now)
         self._tell(now, residual, reference)
@@ -679,13 +681,19 @@ class Agent:
         reference = self.programme.reference(self.id, sample.time_ns)
         return reference.position_ned_m, reference.velocity_ned_m_s
 
-    def _look_near(self, neighbours: list[Neighbour], now: Instant) -> None:
-        """Whom the filter's half-planes show near; of most peers it makes none."""
-        planes = self.safety.peer_planes
-        if planes:
-            lost = {n.vehicle_id for n in neighbours if n.other_end_ned_m is not None}
-            pushes = [(p.vehicle_id, push_m_s2(p)) for p in planes if p.vehicle_id not in lost]
-            self.near.see(pushes, now.monotonic_ns)
+    def _look_near(self, slot_velocity_ned_m_s: Ned, now: Instant) -> None:
+        """Whom the filter's half-planes show near; it makes none of peers that are far."""
+        pushes = {p.vehicle_id: push for p in self.safety.peer_planes if (push := push_m_s2(p)) < PUSH_M_S2}
+        if not pushes:
+            return
+        near = [
+            n.vehicle_id
+            for n in self._neighbours
+            if n.vehicle_id in pushes
+            and n.other_end_ned_m is None
+            and pushes[n.vehicle_id] < near_push_m_s2(n, slot_velocity_ned_m_s, *self._slots_m)
+        ]
+        self.near.see(near, now.monotonic_ns)
 
     def _tell(self, now: Instant, residual: Ned, reference: Reference) -> None:
         """Send a state message if one is due, and count why."""

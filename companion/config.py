@@ -26,7 +26,6 @@ from companion.core.frames import Geodetic, Ned
 from companion.core.hold import HoldKind
 from companion.core.law import Gains, paper_gains
 from companion.core.monitor import PeerMotion
-from companion.core.near import PUSH_M_S2, STEADY_SHARE
 from companion.core.neighbours import PeerLimits
 from companion.core.plan import (
     PADS,
@@ -43,7 +42,7 @@ from companion.core.plan import (
     with_return,
 )
 from companion.core.route import first_breach
-from companion.core.safety import DOWNWASH_RATIO, SafetyLimits, resting_push_m_s2, safety_radius_m
+from companion.core.safety import DOWNWASH_RATIO, SafetyLimits, safety_radius_m
 from companion.core.trigger import (
     ErrorTrigger,
     PeriodicTrigger,
@@ -417,12 +416,6 @@ class FleetConfig(_Table):
     def near_rate(self) -> PeriodicTrigger:
         """When vehicles speak that are near each other."""
         return PeriodicTrigger(self.trigger.near_period_s)
-
-    @cached_property
-    def near_push_m_s2(self) -> float:
-        """A peer is near whose half-plane a smaller push would break: less where the slots themselves are so close."""
-        closest = min(self.formation.spacing_m, minimum_distance(self.slots(self.formation.shape), DOWNWASH_RATIO))
-        return min(PUSH_M_S2, STEADY_SHARE * resting_push_m_s2(closest, self.safety_radius_m))
 
     @property
     def message_spacing(self) -> Spacing:

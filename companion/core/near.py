@@ -1,9 +1,12 @@
 """Near mode: vehicles that are near each other speak at a fixed rate, whatever the trigger says.
 
 Near is the safety filter's own measure. The filter keeps a half-plane g.u >= b for each peer (`core.safety`); -b/|g| is
-the push toward the peer (m/s^2) that would break it. A peer is near while less than `push_m_s2` would, and for HOLD_S
-after. A message names the peers that its sender finds near, so that those speak too: one message that arrives is enough
-for both of a pair to agree. Being named is not passed on, or two would keep each other speaking for ever.
+the push toward the peer (m/s^2) that would break it. A peer is near while less than PUSH_M_S2 would, and for HOLD_S
+after; of two in formation whose slots are so close themselves, once they are that much nearer than in their slots. So a
+tight formation is not near itself, and a vehicle that leaves its slot toward another is.
+
+A message names the peers that its sender finds near, so that those speak too: one message that arrives is enough for
+both of a pair to agree. Being named is not passed on, or two would keep each other speaking for ever.
 
 Who speaks so says in each message that the next one is due soon: a period and a control period later at most. Of such a
 peer a receiver knows that a message is missing; of any other, silence and loss look alike. `near_bound_m` says what the
@@ -17,14 +20,18 @@ distance (`limits.barrier = false`).
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from math import hypot
 
+from companion.core.frames import Ned
 from companion.core.monitor import PeerMotion, unheard_error_m
+from companion.core.safety import DOWNWASH_RATIO, resting_push_m_s2
 from companion.core.trigger import PeriodicTrigger, Situation
+from companion.core.values import Neighbour
 
 PUSH_M_S2 = 2.0
 """a peer is near if a push of this much toward it would break its half-plane"""
-STEADY_SHARE = 0.5
-"""and never at more than this part of the push that the closest slots leave at rest: a tight formation is not near"""
+STEADY_M_S = 0.05
+"""two slots keep their distance if it changes by no more than this"""
 HOLD_S = 1.0
 """how long a peer stays near after the half-plane has receded, and after it named us: a few messages may be lost"""
 MISSING_MAX_M = 1.0
@@ -35,19 +42,16 @@ MISSING_MAX_M = 1.0
 class NearMode:
     """One vehicle's near peers, and when to speak because of them. Times are of the own monotonic clock (ns)."""
 
-    push_m_s2: float
-    """a peer is near whose half-plane a smaller push toward it would break"""
     rate: PeriodicTrigger
     _near_until_ns: dict[int, int] = field(default_factory=dict)
     _named_until_ns: int = 0
     promised: bool = False
     """the last message said that the next one is due soon"""
 
-    def see(self, pushes: Iterable[tuple[int, float]], now_ns: int) -> None:
-        """Take what push (m/s^2) each peer's half-plane allows, (id, push); a peer that is left out is far."""
-        for i, push in pushes:
-            if push < self.push_m_s2:
-                self._near_until_ns[i] = now_ns + round(HOLD_S * 1e9)
+    def see(self, ids: Iterable[int], now_ns: int) -> None:
+        """Take the peers that are near in this tick."""
+        for i in ids:
+            self._near_until_ns[i] = now_ns + round(HOLD_S * 1e9)
 
     def named(self, now_ns: int) -> None:
         """A peer says that this vehicle is near."""
@@ -67,6 +71,21 @@ class NearMode:
     def fires(self, now: Situation, active: bool) -> bool:
         """Whether a message is due, as one was promised, or as the mode begins and the last one is a period old."""
         return (active or self.promised) and self.rate.fires(now)
+
+
+def near_push_m_s2(neighbour: Neighbour, slot_velocity_ned_m_s: Ned, closest_m: float, radius_m: float) -> float:
+    """The push toward a peer below which it is near (m/s^2), the own slot moving at `slot_velocity_ned_m_s`.
+
+    Less than PUSH_M_S2 only of a peer in formation whose slot keeps its distance from the own one: PUSH_M_S2 less than
+    what the two slots leave with the safety radius `radius_m` of a peer whose messages are not missing. No two slots
+    are taken to be closer than `closest_m`, the least that is configured.
+    """
+    o, v, w = neighbour.offset_ned_m, slot_velocity_ned_m_s, neighbour.reference_velocity_ned_m_s
+    apart_m = hypot(o.north, o.east, o.down / DOWNWASH_RATIO)
+    parting = o.north * (v.north - w.north) + o.east * (v.east - w.east) + o.down * (v.down - w.down)
+    if not neighbour.in_formation or abs(parting) > STEADY_M_S * apart_m:
+        return PUSH_M_S2
+    return min(PUSH_M_S2, resting_push_m_s2(max(apart_m, closest_m), radius_m) - PUSH_M_S2)
 
 
 def missing_m(age_s: float, bound_m: float, motion: PeerMotion) -> float:

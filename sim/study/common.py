@@ -29,7 +29,7 @@ Record = dict[str, Any]
 """values that JSON can hold"""
 
 STUDIES = ("example1", "example2", "table3", "readings", "pareto", "faults", "scale", "theory")
-FLOWN_STUDIES = ("headon", "campaign")
+FLOWN_STUDIES = ("headon", "messages", "campaign")
 """studies that fly the real agents in lockstep: minutes to hours, so `all` leaves them out"""
 FLYING_CODE = tuple(
     sorted(p for folder in ("companion", "sim") for p in (Path(__file__).parents[2] / folder).rglob("*.py"))

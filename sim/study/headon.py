@@ -7,7 +7,7 @@ what the law says is replaced, just before the filter, by a command that flies a
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
-from math import dist, inf
+from math import dist
 from random import Random
 from typing import Any, Literal
 
@@ -21,6 +21,7 @@ from companion.errors import ConfigError
 from sim.broken_law import BrokenLaw
 from sim.lockstep import Lockstep
 from sim.network import NetworkParameters
+from sim.never_near import NeverNear
 from sim.study.common import FLYING_CODE, Column, Config, Figure, Outcome, Record, Table, proportion_text, table_of
 from sim.study.figures import BLUE, GREEN, GREY, RED, panels
 
@@ -92,7 +93,7 @@ def meet(
     laws = {}
     for i, v in fleet.vehicles.items():
         if near == "off":
-            v.agent.near.push_m_s2 = -inf
+            v.agent.near = NeverNear(v.agent.near.rate)
         v.agent.safety = laws[i] = BrokenLaw(config.safety_limits)
     fleet.run_until(READY_S, lambda: not any(v.agent.unready(fleet.now) for v in fleet.vehicles.values()))
     fleet.command(b'{"verb":"takeoff"}')

@@ -23,7 +23,6 @@ from companion.config import (
 )
 from companion.core.fence import Fence
 from companion.core.plan import GotoLeg, TurnLeg, VelocityLeg
-from companion.core.safety import resting_push_m_s2
 from companion.errors import ConfigError
 from sim.__main__ import _resize, plan_legs
 
@@ -547,15 +546,6 @@ def test_what_a_hold_leaves_out_counts_in_a_periods_bound(hold: str) -> None:
     config = parse(changed(put("law.hold", hold)), "fleet.toml")
     assert config.peer_motion.deviation_m_s2 == pytest.approx(8.0 + (4.0 / 0.7 if hold == "damped" else 0.0))
     assert config.peer_motion.drift_m_s == (4.0 if hold == "zero" else 0.0)
-
-
-def test_a_tight_formation_is_not_near_itself() -> None:
-    default = parse(default_tables(), "fleet.toml")
-    assert default.near_push_m_s2 == 2.0
-    tight = parse(changed(put("formation.spacing_m", default.safety_radius_m + 0.21)), "fleet.toml")
-    at_rest = resting_push_m_s2(tight.formation.spacing_m, tight.safety_radius_m)
-    assert tight.near_push_m_s2 == pytest.approx(0.5 * at_rest)
-    assert 0.2 < tight.near_push_m_s2 < 0.4
 
 
 def test_the_papers_law_is_selectable() -> None:

@@ -10,7 +10,16 @@ from hypothesis import strategies as st
 from companion.core.frames import Ned
 from companion.core.hold import axis, weights
 from companion.core.monitor import PeerMotion, unheard_error_m
-from companion.core.near import HOLD_S, MISSING_MAX_M, PUSH_M_S2, NearMode, certain_age_s, missing_m, near_bound_m
+from companion.core.near import (
+    HOLD_S,
+    MISSING_MAX_M,
+    PUSH_M_S2,
+    NearMode,
+    certain_age_s,
+    missing_m,
+    near_bound_m,
+    near_push_m_s2,
+)
 from companion.core.safety import HalfPlane, half_plane, push_m_s2, resting_push_m_s2
 from companion.core.trigger import PeriodicTrigger, Situation
 from companion.core.values import ZERO, Neighbour, VehicleState
@@ -25,29 +34,66 @@ HOLD_NS = round(HOLD_S * 1e9)
 
 
 def mode(period_s: float = 0.1) -> NearMode:
-    return NearMode(PUSH_M_S2, PeriodicTrigger(period_s))
+    return NearMode(PeriodicTrigger(period_s))
 
 
 def at(time_ns: int, sent_ns: int) -> Situation:
     return Situation(0.0, 0.0, 0.0, 0.0, time_ns, sent_ns)
 
 
-@pytest.mark.parametrize(("push", "near"), [(1.99, True), (2.0, False), (2.01, False), (-5.0, True)])
-def test_a_peer_is_near_whose_half_plane_a_push_of_2_m_s2_would_break(push: float, near: bool) -> None:
+def test_a_peer_stays_near_for_a_second_after_it_was_found_so() -> None:
     m = mode()
-    m.see([(7, push)], 0)
-    assert m.active(0) is near
-    assert m.peers(0) == ((7,) if near else ())
-
-
-def test_a_peer_stays_near_for_a_second_after_its_half_plane_receded() -> None:
-    m = mode()
-    m.see([(7, 0.0), (3, 1.0)], 0)
-    m.see([(7, 9.0), (3, 1.0)], HOLD_NS // 2)
+    assert not m.active(0)
+    m.see([7, 3], 0)
+    m.see([3], HOLD_NS // 2)
     assert m.peers(HOLD_NS - 1) == (3, 7)
     assert m.peers(HOLD_NS) == (3,)
     assert m.peers(HOLD_NS // 2 + HOLD_NS) == ()
     assert not m.active(HOLD_NS // 2 + HOLD_NS)
+
+
+def in_slots(offset: Ned, *, in_formation: bool = True, slot_velocity: Ned = ZERO) -> Neighbour:
+    return Neighbour(
+        2, ZERO, ZERO, offset, 0.0, in_formation, True, BOUND_M, reference_velocity_ned_m_s=slot_velocity
+    )  # fmt: skip
+
+
+RADIUS_M = 0.65 + BOUND_M
+CLOSEST_M = RADIUS_M + 0.2
+NORTH = Ned(1.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("distance_m", [3.4, 4.0, 100.0])
+def test_a_push_of_2_m_s2_makes_near_where_the_slots_are_wide(distance_m: float) -> None:
+    assert near_push_m_s2(in_slots(Ned(0.0, distance_m, 0.0)), ZERO, CLOSEST_M, RADIUS_M) == PUSH_M_S2
+
+
+@pytest.mark.parametrize("slot_velocity", [ZERO, NORTH, Ned(1.0, 0.0, -0.5)])
+def test_in_tight_slots_it_takes_2_m_s2_less_than_the_slots_leave(slot_velocity: Ned) -> None:
+    """Whether they stand, fly on together or, turning, about each other."""
+    tight = in_slots(Ned(0.0, CLOSEST_M, 0.0), slot_velocity=slot_velocity)
+    turning = in_slots(Ned(0.0, CLOSEST_M, 0.0), slot_velocity=slot_velocity._replace(north=-1.0))
+    for n in (tight, turning):
+        left = resting_push_m_s2(CLOSEST_M, RADIUS_M)
+        assert near_push_m_s2(n, slot_velocity, CLOSEST_M, RADIUS_M) == pytest.approx(left - PUSH_M_S2)
+        assert left > 0.5
+
+
+@pytest.mark.parametrize(
+    "neighbour",
+    [
+        in_slots(Ned(0.0, CLOSEST_M, 0.0), in_formation=False),  # gated, apart or landing
+        in_slots(Ned(0.0, CLOSEST_M, 0.0), slot_velocity=Ned(0.0, 0.1, 0.0)),  # slots that approach or part
+        in_slots(Ned(0.0, CLOSEST_M, 0.0), slot_velocity=Ned(0.0, -0.1, 0.0)),
+    ],
+)
+def test_out_of_steady_slots_2_m_s2_make_near_however_tight(neighbour: Neighbour) -> None:
+    assert near_push_m_s2(neighbour, ZERO, CLOSEST_M, RADIUS_M) == PUSH_M_S2
+
+
+def test_slots_that_cross_never_make_it_less_than_the_closest_configured_would() -> None:
+    crossing, closest = in_slots(Ned(0.0, 0.1, 0.0)), in_slots(Ned(0.0, CLOSEST_M, 0.0))
+    assert near_push_m_s2(crossing, ZERO, CLOSEST_M, RADIUS_M) == near_push_m_s2(closest, ZERO, CLOSEST_M, RADIUS_M)
 
 
 def test_who_is_named_speaks_for_a_second_and_names_nobody_for_it() -> None:
@@ -111,6 +157,13 @@ def test_at_rest_a_pair_that_shares_the_avoidance_is_near_from_2_m_on_at_the_def
     assert resting_push_m_s2(2.25, radius_m) < PUSH_M_S2 < resting_push_m_s2(2.3, radius_m)
     assert resting_push_m_s2(radius_m, radius_m) == 0.0
     assert push_m_s2(pair(2.25, 0.0)[0]) == pytest.approx(resting_push_m_s2(2.25, radius_m))
+
+
+def test_a_message_that_is_missing_makes_near_in_tight_slots_too() -> None:
+    """So the peer is named and speaks again: its word that the next one is not due may be what was lost."""
+    n = in_slots(Ned(0.0, CLOSEST_M, 0.0))._replace(uncertainty_m=BOUND_M + MISSING_MAX_M)
+    assert push_m_s2(pair(CLOSEST_M, 0.0, n.uncertainty_m)[0]) < near_push_m_s2(n, ZERO, CLOSEST_M, RADIUS_M)
+    assert push_m_s2(pair(CLOSEST_M, 0.0)[0]) > near_push_m_s2(n, ZERO, CLOSEST_M, RADIUS_M) + 1.9
 
 
 # -- the bound -------------------------------------------------------------------------------------------------------
