@@ -5,6 +5,8 @@ go in, bytes come out. It never reads a clock and never raises for what others s
 """
 
 import json
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import dist
 from random import Random
@@ -18,6 +20,7 @@ from companion.core.events import Event, MotionAdopted
 from companion.core.failsafe import LATE_S, Failsafe
 from companion.core.frames import Ned, geodetic_to_ned
 from companion.core.law import Law, StarlingLaw
+from companion.core.near import PUSH_M_S2, NearMode, near_push_m_s2
 from companion.core.neighbours import PeerTable, held
 from companion.core.plan import (
     PADS,
@@ -33,9 +36,10 @@ from companion.core.plan import (
     with_return,
 )
 from companion.core.route import first_breach, only_stops
-from companion.core.safety import SafetyFilter
-from companion.core.trigger import exceeds, switching_exceeds
+from companion.core.safety import SafetyFilter, push_m_s2
+from companion.core.trigger import Situation
 from companion.core.values import (
+    AIRBORNE_PHASES,
     FILTERED_PHASES,
     FLYING_PHASES,
     FORMATION_PHASES,
@@ -82,6 +86,12 @@ REJECTED = (
     *(failsafe.value for failsafe in Failsafe),
 )
 """what an agent counts"""
+CAUSES = ("first", "announced", "heartbeat", "triggered", "near")
+"""why a state message is sent: nobody knows us yet; a phase or motion is new, or a peer is, repeats included; T_max has
+passed; the trigger fired; a peer is near"""
+CLOCK_SHIFT_NS = 618_033_989
+"""times a vehicle's place in the file: by so much its trigger's clock is shifted, so that no two vehicles' periods, of
+whatever length, end together"""
 LOOK_PERIOD_NS = 200_000_000
 """who does not steer looks at its peers this often: a crowd on the ground need not work as in the air"""
 
@@ -138,11 +148,15 @@ class Agent:
         self.safety = SafetyFilter(config.safety_limits)
         self.flight = Flight(config, vehicle_id, self.autopilot, self.programme, self.peers, self._restart_filter)
         self.orders = OrderBook()
+        self.trigger = config.trigger_rule
+        self.near = NearMode(config.near_rate)
         self.messages_sent = 0
+        self.sent_because: Counter[str] = Counter(dict.fromkeys(CAUSES, 0))
+        """how many state messages were sent for which of CAUSES"""
         self.setpoints_sent = 0
-        self._error_trigger = config.error_trigger
-        self._switching_trigger = config.switching_trigger
         self._spacing = config.message_spacing
+        self._slots_m = (config.spacing_min_m, config.safety_radius_m)
+        """the least distance of two slots, and the safety radius"""
         self._timer_ns = round(TIMER_SLACK * 1e9 / config.limits.control_rate_hz)
         self._random = Random(vehicle_id << 32 | boot_id)
         self._bias = (BiasObserver(), BiasObserver(), BiasObserver())
@@ -179,6 +193,11 @@ class Agent:
         """Where the vehicle is in its flight."""
         return self.flight.phase
 
+    @property
+    def neighbours(self) -> Sequence[Neighbour]:
+        """The peers as they were last predicted."""
+        return self._neighbours
+
     # -- inputs ------------------------------------------------------------------------------------------------------
 
     def receive_mavlink(self, datagram: bytes, now: Instant) -> bool:
@@ -214,6 +233,8 @@ class Agent:
             self.rejected["state: id is not the key's"] += 1
             return
         if self.peers.accept(message, now) is None:
+            if self.id in message.near_ids:
+                self.near.named(now.monotonic_ns)
             self._compare_motions(message, now)
 
     def receive_presence(self, vehicle_id: int, alive: bool, now: Instant) -> None:
@@ -593,6 +614,7 @@ class Agent:
                 self._outputs.mavlink.append(self._encode(setpoint))
                 self.setpoints_sent += 1
                 steered = True
+            self._look_near(reference.velocity_ned_m_s, now)
         self.flight.settle(ego, reference, now)
         self._propose(now)
         self._tell(now, residual, reference)
@@ -652,50 +674,80 @@ class Agent:
         reference = self.programme.reference(self.id, sample.time_ns)
         return reference.position_ned_m, reference.velocity_ned_m_s
 
+    def _look_near(self, slot_velocity_ned_m_s: Ned, now: Instant) -> None:
+        """Whom the filter's half-planes show near; it makes none of peers that are far."""
+        pushes = {p.vehicle_id: push for p in self.safety.peer_planes if (push := push_m_s2(p)) < PUSH_M_S2}
+        if not pushes:
+            return
+        near = [
+            n.vehicle_id
+            for n in self._neighbours
+            if n.vehicle_id in pushes
+            and n.other_end_ned_m is None
+            and pushes[n.vehicle_id] < near_push_m_s2(n, slot_velocity_ned_m_s, *self._slots_m)
+        ]
+        self.near.see(near, now.monotonic_ns)
+
     def _tell(self, now: Instant, residual: Ned, reference: Reference) -> None:
-        since_s = (now.monotonic_ns - self._sent_ns) * 1e-9
-        if self._sent is None:
-            self._announce(now)
-        due = bool(self._resend_ns) and now.monotonic_ns >= self._resend_ns[0]
-        if due:
-            self._resend_ns = [t for t in self._resend_ns if t > now.monotonic_ns]
-        if self.flight.behind and since_s >= CATCH_UP_NS * 1e-9:
-            due = True
+        """Send a state message if one is due, and count why."""
+        near = self.phase in AIRBORNE_PHASES and self.near.active(now.monotonic_ns)
         filtered = tuple(f.position_m or 0.0 for f in self._filter), tuple(f.velocity_m_s for f in self._filter)
         position, velocity = Ned(*filtered[0]), Ned(*filtered[1])
-        if not due and self._sent is not None:
-            due = self._spacing.decide(
-                since_s, self._silence_limit_s, self._fires(position, velocity, residual, since_s, reference, now)
-            )
-        if not due and self._sent is not None:
+        cause = self._cause(position, velocity, residual, reference, near, now)
+        if cause is None:
             return
         sample = PeerSample(self.id, now.fleet_ns, position, velocity, self.programme.newest.revision, self.phase)
         self._sent = (sample, self._reference_of(sample))
         self._sent_ns = now.monotonic_ns
         self._silence_limit_s = self._spacing.t_max_s * (0.8 + 0.2 * self._random.random())
         self._sequence = (self._sequence + 1) % (1 << 32)
+        self.near.promised = near
         newest = self.programme.newest
-        message = PeerMessage(self.boot_id, self._sequence, newest.start_ns, newest.issuer, sample, self.peers.digest())
+        message = PeerMessage(
+            self.boot_id, self._sequence, newest.start_ns, newest.issuer, sample, self.peers.digest(),
+            near_ids=self.near.peers(now.monotonic_ns) if near else (), due_soon=near,
+        )  # fmt: skip
         self._outputs.peers.append(("state", encode_state(message)))
         self.messages_sent += 1
+        self.sent_because[cause] += 1
 
-    def _fires(
-        self, position: Ned, velocity: Ned, residual: Ned, since_s: float, reference: Reference, now: Instant
-    ) -> bool:
-        assert self._sent is not None
-        sample, reference_then = self._sent
-        p, v = held(sample, reference_then, reference, now.fleet_ns, self.peers.limits)
-        error_p = (position.north - p.north) ** 2 + (position.east - p.east) ** 2 + (position.down - p.down) ** 2
-        error_v = (velocity.north - v.north) ** 2 + (velocity.east - v.east) ** 2 + (velocity.down - v.down) ** 2
-        match self.config.trigger.kind:
-            case "error":
-                return exceeds(error_p, error_v, residual.north**2 + residual.east**2, self._error_trigger)
-            case "switching":
-                since_ns = self.flight.formation_since_ns
-                start = now.fleet_ns if since_ns is None else since_ns
-                return switching_exceeds(error_p, error_v, (now.fleet_ns - start) * 1e-9, self._switching_trigger)
-            case "periodic":
-                return since_s >= self.config.trigger.period_s - 1e-3
+    def _cause(
+        self, position: Ned, velocity: Ned, residual: Ned, reference: Reference, near: bool, now: Instant
+    ) -> str | None:
+        """Which of CAUSES asks for a message; None if nothing does."""
+        since_s = (now.monotonic_ns - self._sent_ns) * 1e-9
+        if self._sent is None:
+            self._announce(now)
+        due = bool(self._resend_ns) and now.monotonic_ns >= self._resend_ns[0]
+        if due:
+            self._resend_ns = [t for t in self._resend_ns if t > now.monotonic_ns]
+        if self._sent is None:
+            return "first"
+        if due or (self.flight.behind and since_s >= CATCH_UP_NS * 1e-9):
+            return "announced"
+        situation = self._situation(self._sent, position, velocity, residual, reference, now)
+        if since_s >= self._silence_limit_s:
+            return "heartbeat"
+        if (since_s >= self._spacing.t_min_s or not self.trigger.waits) and self.trigger.fires(situation):
+            return "triggered"
+        return "near" if self.near.fires(situation, near) else None
+
+    def _situation(
+        self, sent: tuple[PeerSample, tuple[Ned, Ned]], position: Ned, velocity: Ned, residual: Ned,
+        reference: Reference, now: Instant,
+    ) -> Situation:  # fmt: skip
+        """What the trigger decides upon: the own state against what the peers predict of it."""
+        p, v = held(*sent, reference, now.fleet_ns, self.peers.limits)
+        since_ns = self.flight.formation_since_ns
+        shift_ns = CLOCK_SHIFT_NS * self.vehicle.instance
+        return Situation(
+            (position.north - p.north) ** 2 + (position.east - p.east) ** 2 + (position.down - p.down) ** 2,
+            (velocity.north - v.north) ** 2 + (velocity.east - v.east) ** 2 + (velocity.down - v.down) ** 2,
+            residual.north**2 + residual.east**2,
+            0.0 if since_ns is None else (now.fleet_ns - since_ns) * 1e-9,
+            now.monotonic_ns + shift_ns,
+            self._sent_ns + shift_ns,
+        )
 
     # -- telling the operator ----------------------------------------------------------------------------------------
 
@@ -721,6 +773,7 @@ class Agent:
             "nearest_m": tick.nearest_m if tick and tick.nearest_m >= 0 else None,
             "oldest_age_s": age,
             "messages": self.messages_sent,
+            "messages_by_cause": dict(self.sent_because),
             "setpoints": self.setpoints_sent,
             "battery_percent": self.autopilot.battery(now),
             "autopilot_age_s": self.autopilot.heartbeat_age_s(now),

@@ -11,7 +11,7 @@ import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from hashlib import blake2s
-from math import ceil, hypot, inf, radians, sqrt
+from math import ceil, inf, radians, sqrt
 from pathlib import Path
 from typing import Annotated, Any, Literal
 from urllib.parse import urlsplit
@@ -25,7 +25,7 @@ from companion.core.formation import SHAPES, Slots, centred, minimum_distance, r
 from companion.core.frames import Geodetic, Ned
 from companion.core.hold import HoldKind
 from companion.core.law import Gains, paper_gains
-from companion.core.monitor import prediction_error_bound_m
+from companion.core.monitor import PeerMotion
 from companion.core.neighbours import PeerLimits
 from companion.core.plan import (
     PADS,
@@ -43,7 +43,14 @@ from companion.core.plan import (
 )
 from companion.core.route import first_breach
 from companion.core.safety import DOWNWASH_RATIO, SafetyLimits, safety_radius_m
-from companion.core.trigger import RAISED_MAX_M, ErrorTrigger, Spacing, SwitchingTrigger, TriggerKind
+from companion.core.trigger import (
+    ErrorTrigger,
+    PeriodicTrigger,
+    Spacing,
+    SwitchingTrigger,
+    Trigger,
+    TriggerKind,
+)
 from companion.core.values import ZERO
 from companion.errors import ConfigError
 
@@ -66,8 +73,8 @@ SPACING_MARGIN_M = 0.2
 """slots stay this much farther apart than separation and barrier begin to act"""
 STALE_AFTER = 2.1
 """a peer is stale after this many T_max without a word: one message may be lost"""
-EXCHANGE_LATENCY_S = 0.1
-"""delay to a peer and t_min together, as the error bound takes them beside the control period"""
+EXCHANGE_DELAY_S = 0.05
+"""delay to a peer, as the error bound takes it beside t_min and the control period"""
 
 
 class _Table(BaseModel):
@@ -174,6 +181,9 @@ class TriggerTable(_Table):
     t_max_s: Annotated[float, Field(gt=0, le=60, allow_inf_nan=False)] = 10.0
     period_s: Positive = 0.05
     """of kind "periodic" """
+    near_period_s: Annotated[float, Field(ge=0.05, le=0.2, allow_inf_nan=False)] = 0.1
+    """how often vehicles speak that are near each other; never off, since without it the safety filter does not hold
+    under loss"""
     alpha: NotNegative = 0.1
     beta: NotNegative = 0.3
     delta_min: Positive = 0.01
@@ -390,15 +400,22 @@ class FleetConfig(_Table):
             return paper_gains(law.k_s, law.k_a, law.k_c, self.r0_m)._replace(a_max=law.a_max_m_s2)
         return Gains(law.k_s, law.k_a, law.k_c, law.k_v, law.k_p, self.r0_m, law.a_max_m_s2, 1.0, 1.0, 1.0)
 
-    @property
-    def error_trigger(self) -> ErrorTrigger:
+    @cached_property
+    def trigger_rule(self) -> Trigger:
+        """The trigger of the configured kind."""
         t = self.trigger
-        return ErrorTrigger(t.epsilon_m, t.gamma_s2, t.kappa)
+        match t.kind:
+            case "error":
+                return ErrorTrigger(t.epsilon_m, t.gamma_s2, t.kappa)
+            case "switching":
+                return SwitchingTrigger(t.gamma_s2, t.alpha, t.beta, t.delta_min, t.delta_f, t.eta)
+            case "periodic":
+                return PeriodicTrigger(t.period_s)
 
     @property
-    def switching_trigger(self) -> SwitchingTrigger:
-        t = self.trigger
-        return SwitchingTrigger(t.gamma_s2, t.alpha, t.beta, t.delta_min, t.delta_f, t.eta)
+    def near_rate(self) -> PeriodicTrigger:
+        """When vehicles speak that are near each other."""
+        return PeriodicTrigger(self.trigger.near_period_s)
 
     @property
     def message_spacing(self) -> Spacing:
@@ -407,16 +424,33 @@ class FleetConfig(_Table):
     @property
     def prediction_error_m(self) -> float:
         """Bound on how far a peer that is heard may be from its prediction (m)."""
-        t, limits = self.trigger, self.limits
-        epsilon = {
-            "error": hypot(t.epsilon_m, RAISED_MAX_M),
-            "switching": sqrt(max(t.alpha + t.delta_min, t.delta_f)),
-        }.get(t.kind, 0.1)
-        return prediction_error_bound_m(
-            epsilon_m=epsilon, gamma_s2=t.gamma_s2, sigma_p_m=limits.position_noise_m,
-            sigma_v_m_s=limits.velocity_noise_m_s, sigma_gust_m_s2=limits.gust_m_s2,
-            a_max_m_s2=self.law.a_max_m_s2, latency_s=EXCHANGE_LATENCY_S + 1.0 / limits.control_rate_hz,
-        )  # fmt: skip
+        return self.trigger_rule.error_bound_m(self.peer_motion)
+
+    @property
+    def peer_motion(self) -> PeerMotion:
+        """What the vehicles must reckon with in each other.
+
+        The hold brakes the velocity of a vehicle that may fly at the speed limit relative to its plan; the filter may
+        push it on meanwhile. The paper's hold lets it stand.
+        """
+        x = self.limits
+        braking = x.speed_max_m_s / self.law.hold_damping_s if self.law.hold == "damped" else 0.0
+        return PeerMotion(
+            sigma_p_m=x.position_noise_m,
+            sigma_v_m_s=x.velocity_noise_m_s,
+            sigma_gust_m_s2=x.gust_m_s2,
+            a_max_m_s2=self.law.a_max_m_s2,
+            deviation_m_s2=max(x.avoidance_acceleration_m_s2, self.law.a_max_m_s2) + braking,
+            drift_m_s=x.speed_max_m_s if self.law.hold == "zero" else 0.0,
+            speed_m_s=2.0 * x.speed_max_m_s,
+            latency_s=EXCHANGE_DELAY_S + self.trigger.t_min_s + 1.0 / x.control_rate_hz,
+            t_max_s=self.trigger.t_max_s,
+        )
+
+    @property
+    def radius_reason(self) -> str:
+        """Where the safety radius comes from, for messages."""
+        return f"{self.prediction_error_m:.2f} m of it since a peer is known no better with {self.trigger_rule.cause}"
 
     @property
     def safety_radius_m(self) -> float:
@@ -444,6 +478,7 @@ class FleetConfig(_Table):
             stale_after_s=STALE_AFTER * self.trigger.t_max_s,
             isolated_flight_s=self.peers.isolated_flight_s,
             uncertainty_m=self.prediction_error_m,
+            motion=self.peer_motion,
             digest_size=self.peers.digest,
         )
 
@@ -494,7 +529,7 @@ class FleetConfig(_Table):
             raise ConfigError(
                 f"$.formation.spacing_m: {shape!r} needs at least {self.spacing_min_m:.2f} m "
                 f"(the larger of separation's range {self.r0_m:.2f} m and the safety radius "
-                f"{self.safety_radius_m:.2f} m, and {SPACING_MARGIN_M} m), got {nearest:.2f} m"
+                f"{self.safety_radius_m:.2f} m, {self.radius_reason}, and {SPACING_MARGIN_M} m), got {nearest:.2f} m"
             )
         if minimum_distance(slots, DOWNWASH_RATIO) < self.safety_radius_m + SPACING_MARGIN_M and self.limits.barrier:
             raise ConfigError(
@@ -679,8 +714,13 @@ def _faults(config: FleetConfig) -> Iterator[str]:
     if minimum_distance(pads) < config.safety_radius_m and config.limits.barrier:
         yield (
             f"$.launch.spacing_m / $.vehicle[].pad_m: pads must be at least the safety radius "
-            f"{config.safety_radius_m:.2f} m apart, got {minimum_distance(pads):.2f} m"
+            f"{config.safety_radius_m:.2f} m apart ({config.radius_reason}), got {minimum_distance(pads):.2f} m"
         )
+    t = config.trigger
+    if t.t_min_s > t.near_period_s:
+        yield f"$.trigger.t_min_s must be <= $.trigger.near_period_s = {t.near_period_s:g} s, got {t.t_min_s:g}"
+    if t.kind == "periodic" and t.period_s < t.t_min_s:
+        yield f"$.trigger.period_s must be >= $.trigger.t_min_s = {t.t_min_s:g} s, got {t.period_s:g}"
     if config.trigger.t_min_s >= config.trigger.t_max_s:
         yield (
             f"$.trigger.t_min_s must be below $.trigger.t_max_s = {config.trigger.t_max_s:g} s, "

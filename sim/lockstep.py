@@ -8,6 +8,7 @@ import json
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
+from math import dist
 from random import Random
 from typing import Any
 
@@ -56,6 +57,26 @@ class Sent:
 
 
 @dataclass(slots=True)
+class BoundCount:
+    """How the true error of near peers' predictions compares with what their receivers take it to be at most."""
+
+    looks: int = 0
+    """predictions of a peer that speaks in near mode, one a control tick and pair"""
+    exceeded: int = 0
+    """of those, how many are farther from the truth than their bound"""
+    worst: float = 0.0
+    """largest error as a part of its bound"""
+    error_max_m: float = 0.0
+
+    def see(self, error_m: float, bound_m: float) -> None:
+        """Take one prediction."""
+        self.looks += 1
+        self.exceeded += not error_m <= bound_m
+        self.worst = max(self.worst, error_m / bound_m)
+        self.error_max_m = max(self.error_max_m, error_m)
+
+
+@dataclass(slots=True)
 class Lockstep:
     """A fleet in lockstep. Drive it with `run_until`, `take_off`, `command`, and the faults."""
 
@@ -75,6 +96,7 @@ class Lockstep:
     """(fleet time, vehicle, what happened)"""
     own_id_heard: Counter[int] = field(default_factory=Counter)
     """puts that reached a vehicle under its own id"""
+    near_bound: BoundCount = field(default_factory=BoundCount)
     _truth: list[bytes] = field(default_factory=list)
     _net: Network = field(init=False)
     _queue: list[tuple[int, int, Callable[..., None], tuple[Any, ...]]] = field(default_factory=list)
@@ -221,6 +243,14 @@ class Lockstep:
             self.events.append((self.now.fleet_ns, i, event))
         self.notes += [(self.now_ns * 1e-9, i, note) for note in out.notes]
         self._send(i, out, v.agent)
+        if out.tick is not None and out.tick.steered:
+            self._look_at_bounds(v.agent)
+
+    def _look_at_bounds(self, agent: Agent) -> None:
+        for n in agent.neighbours:
+            if n.other_end_ned_m is None and agent.peers.due_soon(n.vehicle_id):
+                true = self.vehicles[n.vehicle_id].autopilot.truth().position_ned_m
+                self.near_bound.see(dist(n.position_ned_m, true), n.uncertainty_m)
 
     def _send(self, i: int, out: Outputs, sender: Agent) -> None:
         """What a companion sends goes on its ways, to its autopilot and to all who hear."""

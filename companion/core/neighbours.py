@@ -10,6 +10,8 @@ from companion.core.failsafe import FROZEN_S, SUSPECT_S, Failsafe
 from companion.core.frames import Ned
 from companion.core.health import MOVING_M_S, jumped
 from companion.core.hold import HoldKind, axis, weights
+from companion.core.monitor import PeerMotion
+from companion.core.near import near_bound_m
 from companion.core.plan import Moment, Programme, Reference
 from companion.core.values import (
     AIRBORNE_PHASES,
@@ -65,6 +67,8 @@ class PeerLimits:
     """how long a vehicle that hears nobody flies on before it holds by itself"""
     uncertainty_m: float
     """bound on the prediction's error of a peer that is heard"""
+    motion: PeerMotion
+    """what a peer can do unseen"""
     digest_size: int
 
 
@@ -112,6 +116,8 @@ class _Peer:
     """it is lost by its silence, not by the end of its presence"""
     suspect_until_ns: int = 0
     """fleet time until which nothing is built on what it says"""
+    due_soon: bool = False
+    """its last message came in near mode, so that one that is missing is known to be"""
     same_since_ns: int = 0
     """time of the first sample with its present position"""
 
@@ -150,6 +156,7 @@ class PeerTable:
                 if peer.boot_id == message.boot_id:
                     self._examine(peer, sample, now)
                 peer.boot_id, peer.sequence = message.boot_id, message.sequence
+                peer.due_soon = message.due_soon
                 self._store(peer, sample)
         if reason is not None:
             self.rejected[reason] += 1
@@ -243,6 +250,10 @@ class PeerTable:
         """The latest sample of a peer, its own or by digest."""
         return self._peers[vehicle_id].sample
 
+    def due_soon(self, vehicle_id: int) -> bool:
+        """Whether a peer last said that it speaks in near mode, so that its messages are known to be due."""
+        return self._peers[vehicle_id].due_soon
+
     def boot_id(self, vehicle_id: int) -> int | None:
         """The boot id a peer last gave."""
         return self._peers[vehicle_id].boot_id
@@ -330,6 +341,8 @@ class PeerTable:
             since_s = (now.fleet_ns - peer.lost_at_ns) * 1e-9
             uncertainty += min(UNCERTAINTY_GROWTH_M_S * max(since_s, 0.0), UNCERTAINTY_GROWTH_MAX_M)
             position, velocity, other_end = self._both_ends(peer, sample, peer.lost_at_ns, now)
+        elif peer.due_soon:
+            uncertainty = near_bound_m(tau_s, uncertainty, limits.motion)
         slot = reference.position_ned_m
         # By place: naming the fields costs as much again, for every peer at every tick.
         return Neighbour(

@@ -204,6 +204,16 @@ def out_of_reach(ego: VehicleState, shared_acceleration: Ned, neighbour: Neighbo
     return reach * reach <= x * x + y * y + z * z < FAR_M * FAR_M
 
 
+def resting_push_m_s2(distance_m: float, radius_m: float) -> float:
+    """`push_m_s2` of a pair that rests at a level distance and shares the avoidance, with its safety radius (m/s^2)."""
+    return push_m_s2(HalfPlane(*barrier(distance_m, 0.0, 0.0, 0.0, 0.0, 0.0, radius_m, True, 0.0, 0.0), 0))
+
+
+def push_m_s2(plane: HalfPlane) -> float:
+    """The push toward the peer that would just break its half-plane, -b/|g| (m/s^2); negative: it is broken at rest."""
+    return -plane.b / max(hypot(plane.g_north, plane.g_east), 1e-6)
+
+
 def avoid(
     u_north: float, u_east: float, v_north: float, v_east: float, rows: Sequence[MutableSequence[float]], peers: int,
     count: int, most: float, spare: Sequence[MutableSequence[float]],
@@ -265,6 +275,8 @@ class SafetyFilter:
     velocity_reference: VelocityReference = field(default_factory=VelocityReference)
     acceleration_m_s2: tuple[float, float] = (0.0, 0.0)
     """what was flown last: horizontal, after the filter"""
+    peer_planes: list[HalfPlane] = field(default_factory=list)
+    """the half-planes of the peers within reach, as of the last command"""
     _acted: set[str] = field(default_factory=set)
     """which limits acted in this tick"""
 
@@ -304,6 +316,7 @@ class SafetyFilter:
             planes = [half_plane(ego, shared, n) for n in neighbours if not out_of_reach(ego, shared, n, most)]
             known = [p for p in planes if isfinite(p.g_north + p.g_east + p.b)]
             unknown, planes = len(planes) - len(known), known
+        self.peer_planes = planes
         if unknown:
             self._acted.add("peer not finite: braking")
             u = self._clipped(-v_north, -v_east)

@@ -96,6 +96,10 @@ class PeerMessage:
     sample: PeerSample
     digest: tuple[PeerSample, ...]
     """the sender's latest samples of others, newest first"""
+    near_ids: tuple[int, ...] = ()
+    """vehicles that the sender finds near (`core.near`), ascending"""
+    due_soon: bool = False
+    """the sender speaks in near mode: its next message comes within `trigger.near_period_s` and a control period"""
 
 
 class Neighbour(NamedTuple):

@@ -1,15 +1,17 @@
 """Peer messages as bytes: little-endian, fixed layout, a version in front.
 
     header  B version, B vehicle id, B phase, B digest entries, I boot id, I sequence, I revision, q motion start ns,
-            B motion issuer
+            B motion issuer, B flags (1: the next message is due soon), B near ids
     sample  q time ns, 3f position (m), 3f velocity (m/s)                                  fleet frame, NED
     digest  for each entry: B vehicle id, B phase, I revision, sample
+    near    for each id: B vehicle id, ascending
 
 A motion travels as JSON (`encode_motion`): it is rare, and a person can read it in a capture.
 """
 
 import json
 import struct
+from itertools import pairwise
 from math import isfinite
 from typing import Annotated, Literal
 
@@ -20,13 +22,15 @@ from companion.core.plan import GotoLeg, Leg, Motion, SlotChange, TurnLeg, Veloc
 from companion.core.values import PeerMessage, PeerSample, Phase
 from companion.errors import WireError
 
-VERSION = 2
-"""2: thirteen phases instead of seven"""
-WIRE_FAULTS = ("version", "length", "phase", "not finite", "out of range", "motion")
+VERSION = 3
+"""3: near mode's flag and ids"""
+WIRE_FAULTS = ("version", "length", "phase", "flags", "near ids", "not finite", "out of range", "motion")
 """every kind of WireError that is raised here"""
 PLAUSIBLE_MAX = 1e6
 """no position (m) or velocity (m/s) is larger than this: float32 holds far more, and squares of it overflow later"""
-_HEADER = struct.Struct("<BBBBIIIqB")
+DUE_SOON = 1
+"""flag: the next message is due within `trigger.near_period_s` and a control period"""
+_HEADER = struct.Struct("<BBBBIIIqBBB")
 _SAMPLE = struct.Struct("<q6f")
 _ENTRY = struct.Struct("<BBI")
 
@@ -37,12 +41,13 @@ def encode_state(message: PeerMessage) -> bytes:
     parts = [
         _HEADER.pack(
             VERSION, s.vehicle_id, s.phase, len(message.digest), message.boot_id, message.sequence, s.revision,
-            message.motion_start_ns, message.motion_issuer,
+            message.motion_start_ns, message.motion_issuer, DUE_SOON * message.due_soon, len(message.near_ids),
         ),
         _sample_bytes(s),
     ]  # fmt: skip
     for entry in message.digest:
         parts += [_ENTRY.pack(entry.vehicle_id, entry.phase, entry.revision), _sample_bytes(entry)]
+    parts.append(bytes(message.near_ids))
     return b"".join(parts)
 
 
@@ -51,21 +56,29 @@ def _sample_bytes(s: PeerSample) -> bytes:
 
 
 def decode_state(payload: bytes) -> PeerMessage:
-    """A state message from its payload; WireError for a wrong version, length, phase or a number that is not finite."""
+    """A state message from its payload; WireError for a wrong version, length, phase, flag or order of near ids, or a
+    number that is not finite."""
     if len(payload) < 1 or payload[0] != VERSION:
         raise WireError("version")
     if len(payload) < _HEADER.size + _SAMPLE.size:
         raise WireError("length")
-    _, vehicle_id, phase, entries, boot_id, sequence, revision, start_ns, issuer = _HEADER.unpack_from(payload)
+    _, vehicle_id, phase, entries, boot_id, sequence, revision, start_ns, issuer, flags, near = _HEADER.unpack_from(
+        payload
+    )
     each = _ENTRY.size + _SAMPLE.size
-    if len(payload) != _HEADER.size + _SAMPLE.size + entries * each:
+    if len(payload) != _HEADER.size + _SAMPLE.size + entries * each + near:
         raise WireError("length")
+    if flags & ~DUE_SOON:
+        raise WireError("flags")
+    near_ids = tuple(payload[len(payload) - near :])
+    if any(a >= b for a, b in pairwise(near_ids)):
+        raise WireError("near ids")
     sample = _sample(payload, _HEADER.size, vehicle_id, phase, revision)
     digest = []
     for k in range(entries):
         at = _HEADER.size + _SAMPLE.size + k * each
         digest.append(_sample(payload, at + _ENTRY.size, *_ENTRY.unpack_from(payload, at)))
-    return PeerMessage(boot_id, sequence, start_ns, issuer, sample, tuple(digest))
+    return PeerMessage(boot_id, sequence, start_ns, issuer, sample, tuple(digest), near_ids, bool(flags & DUE_SOON))
 
 
 def _sample(payload: bytes, at: int, vehicle_id: int, phase: int, revision: int) -> PeerSample:
@@ -112,7 +125,7 @@ class _GotoLeg(_Model):
 
 
 class _Motion(_Model):
-    version: Literal[2]
+    version: Literal[3]
     revision: Annotated[int, Field(ge=0, lt=1 << 32)]
     start_ns: Annotated[int, Field(ge=0, lt=1 << 63)]
     issuer: Annotated[int, Field(ge=0, le=255)]

@@ -29,7 +29,7 @@ Record = dict[str, Any]
 """values that JSON can hold"""
 
 STUDIES = ("example1", "example2", "table3", "readings", "pareto", "faults", "scale", "theory")
-FLOWN_STUDIES = ("headon", "campaign")
+FLOWN_STUDIES = ("headon", "messages", "campaign")
 """studies that fly the real agents in lockstep: minutes to hours, so `all` leaves them out"""
 FLYING_CODE = tuple(
     sorted(p for folder in ("companion", "sim") for p in (Path(__file__).parents[2] / folder).rglob("*.py"))
@@ -37,7 +37,7 @@ FLYING_CODE = tuple(
 """everything that flies in those: their finished seeds are run anew when any of it changes"""
 
 # Payloads as `companion.wire.peer` lays them out (bytes); the published intent carries c, g, w, e, e' instead of p, v.
-MESSAGE_BYTES = 57
+MESSAGE_BYTES = 59
 DIGEST_ENTRY_BYTES = 38
 INTENT_EXTRA_BYTES = 36
 

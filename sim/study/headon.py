@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from itertools import product
 from math import dist
 from random import Random
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from companion.errors import ConfigError
 from sim.broken_law import BrokenLaw
 from sim.lockstep import Lockstep
 from sim.network import NetworkParameters
+from sim.never_near import NeverNear
 from sim.study.common import FLYING_CODE, Column, Config, Figure, Outcome, Record, Table, proportion_text, table_of
 from sim.study.figures import BLUE, GREEN, GREY, RED, panels
 
@@ -35,6 +36,10 @@ CLIMB_S = 30.0
 MEETING_S = 16.0
 SCATTER_M = 0.05
 """how far the two pads' lines lie apart at most"""
+
+
+Near = Literal["10 Hz", "20 Hz", "off"]
+"""near mode as it is flown, at twice its rate, and without it"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,13 +61,14 @@ def meeting_of(config: Config) -> Meeting:
     return table_of(config, "meeting", Meeting)
 
 
-def _fleet(meeting: Meeting, lag_s: float, barrier: bool, aside_m: float) -> FleetConfig:
+def _fleet(meeting: Meeting, lag_s: float, barrier: bool, near: Near, aside_m: float) -> FleetConfig:
     half = 0.5 * meeting.apart_m
     return parse(
         {
             "fleet": {"name": "headon", "frame": "local"},
             "formation": {"altitude_m": meeting.altitude_m},
             "plan": {"automatic": False},
+            "trigger": {"near_period_s": 0.05 if near == "20 Hz" else 0.1},
             "limits": {
                 "barrier": barrier, "position_noise_m": meeting.noise_m, "velocity_noise_m_s": meeting.noise_m,
                 "gust_m_s2": meeting.gust_m_s2,
@@ -77,12 +83,17 @@ def _fleet(meeting: Meeting, lag_s: float, barrier: bool, aside_m: float) -> Fle
     )  # fmt: skip
 
 
-def meet(meeting: Meeting, seed: int, *, lag_s: float, delay_s: float, loss: float, barrier: bool = True) -> Record:
+def meet(
+    meeting: Meeting, seed: int, *, lag_s: float, delay_s: float, loss: float, barrier: bool = True,
+    near: Near = "10 Hz",
+) -> Record:  # fmt: skip
     """Fly one meeting; the smallest true distance of the two (m), and what it took."""
-    config = _fleet(meeting, lag_s, barrier, Random(f"headon/{seed}").uniform(-SCATTER_M, SCATTER_M))
+    config = _fleet(meeting, lag_s, barrier, near, Random(f"headon/{seed}").uniform(-SCATTER_M, SCATTER_M))
     fleet = Lockstep(config, seed=seed, network=NetworkParameters(delay_s=delay_s, loss=loss))
     laws = {}
     for i, v in fleet.vehicles.items():
+        if near == "off":
+            v.agent.near = NeverNear(v.agent.near.rate)
         v.agent.law = laws[i] = BrokenLaw(v.agent.law)
     fleet.run_until(READY_S, lambda: not any(v.agent.unready(fleet.now) for v in fleet.vehicles.values()))
     fleet.command(b'{"verb":"takeoff"}')
@@ -104,6 +115,9 @@ def meet(meeting: Meeting, seed: int, *, lag_s: float, delay_s: float, loss: flo
         "minimum_distance_m": float(np.linalg.norm(met[:, 0] - met[:, 1], axis=1).min()),
         "passed": passed(),
         "messages": len(fleet.sent) - sent,
+        "bound_looks": fleet.near_bound.looks,
+        "bound_exceeded": fleet.near_bound.exceeded,
+        "bound_worst": fleet.near_bound.worst,
         "not_attainable": sum(v.agent.safety.counts["peer distance not attainable"] for v in fleet.vehicles.values()),
     }
 

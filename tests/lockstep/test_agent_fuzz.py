@@ -98,12 +98,14 @@ class Noise:
 
         about, entries = r.randrange(256), r.randrange(4)
         payload = struct.pack(
-            "<BBBBIIIqB", VERSION, about, r.randrange(15), entries, r.getrandbits(32), r.getrandbits(32),
+            "<BBBBIIIqBBB", VERSION, about, r.randrange(15), entries, r.getrandbits(32), r.getrandbits(32),
             r.choice([0, 1, 2, 2**32 - 1]), r.choice([0, now.fleet_ns, 2**63 - 1, -(2**63)]), r.randrange(256),
+            r.choice([0, 0, 1, 1, 7]), near := r.randrange(5),
         )  # fmt: skip
         payload += sample()
         for _ in range(entries):
             payload += struct.pack("<BBI", r.randrange(1, 5), r.randrange(15), r.getrandbits(32)) + sample()
+        payload += bytes(r.choices(range(256), k=near) if r.random() < 0.2 else range(1, 1 + near))
         return f"fleet/{about}/state", payload
 
     def lie(self, vehicle_id: int, now: Instant) -> tuple[str, bytes]:

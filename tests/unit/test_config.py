@@ -147,6 +147,8 @@ RANGES = [
     ("law.a_max_m_s2", 0.0, "a finite number > 0 and <= 20 m/s^2"),
     ("trigger.kind", "always", "'error', 'switching' or 'periodic'"),
     ("trigger.gamma_s2", 0.0, "a finite number > 0 and <= 100000 s^2"),
+    ("trigger.near_period_s", 0.049, "a finite number >= 0.05 and <= 0.2 s"),
+    ("trigger.near_period_s", 0.21, "a finite number >= 0.05 and <= 0.2 s"),
     ("trigger.t_max_s", 61.0, "a finite number > 0 and <= 60 s"),
     ("limits.speed_max_m_s", 12.1, "a finite number >= 0.2 and <= 12 m/s"),
     ("limits.climb_max_m_s", 3.1, "a finite number > 0 and <= 3 m/s"),
@@ -311,6 +313,13 @@ def line_within(radius_m: float) -> Change:
     return change
 
 
+def periodic(period_s: float) -> Change:
+    def change(tables: Tables) -> None:
+        tables["trigger"].update(kind="periodic", period_s=period_s)
+
+    return change
+
+
 def polygon(*corners: list[int]) -> Change:
     return fence(polygon_m=list(corners))
 
@@ -332,6 +341,11 @@ ACROSS = [
     (put("launch.spacing_m", 1.0), "$.launch.spacing_m", "at least the safety radius 1.49 m", "got 1.00 m"),
     (put("vehicle.0.pad_m", [-2.0, -7.5]), "$.vehicle[].pad_m", "at least the safety radius", "got"),
     (put("trigger.t_min_s", 10.0), "$.trigger.t_min_s", "below $.trigger.t_max_s = 10 s", "got 10"),
+    (put("trigger.t_min_s", 0.11), "$.trigger.t_min_s", "<= $.trigger.near_period_s = 0.1 s", "got 0.11"),
+    (periodic(0.04), "$.trigger.period_s", ">= $.trigger.t_min_s = 0.05 s", "got 0.04"),
+    (periodic(60.0), "$.launch.spacing_m", "81.89 m apart (81.24 m of it since a peer is known no better with "
+     "$.trigger.period_s = 60 s)", "got 4.00"),
+    (periodic(0.6), "$.launch.spacing_m", "known no better with $.trigger.period_s = 0.6 s", "got 4.00"),
     (put(f"{VELOCITY}.north_m_s", 3.1), "$.plan.legs[0]", "<= 3 m/s (3/4 of $.limits.speed_max_m_s)", "got 3.1"),
     (put(f"{VELOCITY}.up_m_s", 1.2), "$.plan.legs[0].up_m_s", "<= 1.125 m/s", "got 1.2"),
     (put(f"{VELOCITY}.up_m_s", -0.8), "$.plan.legs[0].up_m_s", ">= -0.75", "got -0.8"),
@@ -515,6 +529,23 @@ def test_pads_are_a_grid_about_the_origin_in_the_files_order() -> None:
     assert sum(v.pad_east_m for v in vehicles) == pytest.approx(0.0)
     assert vehicles[0].pad_north_m - vehicles[5].pad_north_m == pytest.approx(4.0)
     assert vehicles[1].pad_east_m - vehicles[0].pad_east_m == pytest.approx(4.0)
+
+
+def test_the_safety_radius_follows_the_trigger() -> None:
+    """No kind has a radius by default: a slower period gives a larger one, and what is too large is refused."""
+    radii = [parse(changed(periodic(p)), "fleet.toml").safety_radius_m for p in (0.05, 0.1, 0.2, 0.4)]
+    assert radii == sorted(radii)
+    assert radii[0] == pytest.approx(0.65 + 0.285 + 0.17 * 0.285 + 0.5 * (8.0 + 4.0 / 0.7 + 1.2) * 0.17**2)
+    assert radii[-1] > 2 * radii[0]
+    late = parse(changed(put("trigger.t_min_s", 0.1)), "fleet.toml")
+    assert late.safety_radius_m > parse(default_tables(), "fleet.toml").safety_radius_m
+
+
+@pytest.mark.parametrize("hold", ["damped", "zero", "first"])
+def test_what_a_hold_leaves_out_counts_in_a_periods_bound(hold: str) -> None:
+    config = parse(changed(put("law.hold", hold)), "fleet.toml")
+    assert config.peer_motion.deviation_m_s2 == pytest.approx(8.0 + (4.0 / 0.7 if hold == "damped" else 0.0))
+    assert config.peer_motion.drift_m_s == (4.0 if hold == "zero" else 0.0)
 
 
 def test_the_papers_law_is_selectable() -> None:

@@ -9,11 +9,13 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from companion.core.monitor import (
+    PeerMotion,
     algebraic_connectivity,
     centroid_error_m,
     formation_error_m,
     minimum_distance_m,
     prediction_error_bound_m,
+    unheard_error_m,
     velocity_error_m_s,
 )
 
@@ -64,17 +66,24 @@ def test_algebraic_connectivity_of_known_graphs(positions: np.ndarray, range_m: 
     assert algebraic_connectivity(positions, range_m) == pytest.approx(expected, abs=1e-9)
 
 
+MOTION = PeerMotion(
+    sigma_p_m=0.05, sigma_v_m_s=0.05, sigma_gust_m_s2=0.3, a_max_m_s2=5.0, deviation_m_s2=12.0, drift_m_s=0.0,
+    speed_m_s=8.0, latency_s=0.1, t_max_s=10.0,
+)  # fmt: skip
+
+
 def test_the_prediction_bound_of_law_and_defaults() -> None:
-    bound = prediction_error_bound_m(
-        epsilon_m=0.3, gamma_s2=0.1, sigma_p_m=0.05, sigma_v_m_s=0.05, sigma_gust_m_s2=0.3, a_max_m_s2=5.0,
-        latency_s=0.1,
-    )  # fmt: skip
     by_hand = 0.3 + 5.7 * 0.05 + 0.1 * (0.3 / sqrt(0.1) + 5.7 * 0.05) + 0.5 * (10.0 + 1.2) * 0.01
-    assert isclose(bound, by_hand, rel_tol=1e-12)
+    assert isclose(prediction_error_bound_m(0.3, 0.1, MOTION), by_hand, rel_tol=1e-12)
 
 
 def test_without_latency_and_noise_the_bound_is_the_threshold() -> None:
-    bound = prediction_error_bound_m(
-        epsilon_m=0.3, gamma_s2=0.1, sigma_p_m=0.0, sigma_v_m_s=0.0, sigma_gust_m_s2=0.0, a_max_m_s2=5.0, latency_s=0.0
-    )
-    assert bound == 0.3
+    still = MOTION._replace(sigma_p_m=0.0, sigma_v_m_s=0.0, sigma_gust_m_s2=0.0, latency_s=0.0)
+    assert prediction_error_bound_m(0.3, 0.1, still) == 0.3
+
+
+def test_the_bound_of_a_silent_vehicle_by_hand() -> None:
+    assert unheard_error_m(0.0, MOTION) == 5.7 * 0.05
+    assert isclose(unheard_error_m(0.5, MOTION), 5.7 * 0.05 + 0.5 * 5.7 * 0.05 + 0.5 * (12.0 + 1.2) * 0.25)
+    assert isclose(unheard_error_m(0.5, MOTION._replace(drift_m_s=4.0)), unheard_error_m(0.5, MOTION) + 2.0)
+    assert isclose(unheard_error_m(10.0, MOTION), 5.7 * 0.05 + 80.0)  # two that fly apart at 4 m/s each

@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 from companion.core.formation import shape_slots
 from companion.core.frames import Ned
 from companion.core.hold import HoldKind
+from companion.core.monitor import PeerMotion, unheard_error_m
+from companion.core.near import MISSING_MAX_M, certain_age_s
 from companion.core.neighbours import (
     FUTURE_LIMIT_S,
     GATE_RESIDUAL_M,
@@ -28,9 +30,13 @@ from companion.core.values import Instant, Neighbour, PeerMessage, PeerSample, P
 PROPERTY = settings(deadline=None, max_examples=60)
 START_NS = 1_790_000_000_000_000_000
 ZERO = Ned(0.0, 0.0, 0.0)
+MOTION = PeerMotion(
+    sigma_p_m=0.01, sigma_v_m_s=0.01, sigma_gust_m_s2=0.0, a_max_m_s2=5.0, deviation_m_s2=12.0, drift_m_s=0.0,
+    speed_m_s=8.0, latency_s=0.1, t_max_s=5.0,
+)  # fmt: skip
 LIMITS = PeerLimits(
     hold="damped", hold_damping_s=0.7, range_m=100.0, stale_after_s=12.0, isolated_flight_s=5.0, uncertainty_m=0.4,
-    digest_size=3,
+    motion=MOTION, digest_size=3,
 )  # fmt: skip
 OWN = 1
 
@@ -461,6 +467,54 @@ def test_gating_with_nobody_or_one_peer_gates_nobody() -> None:
     s = sample(t, 2, 1.0)
     t.accept(message(s._replace(position_ned_m=Ned(50.0, 0.0, 0.0))), at(1.0))
     assert predicted(t, 1.0, gated=True)[2].in_formation
+
+
+# -- near mode -------------------------------------------------------------------------------------------------------
+
+
+def test_of_a_peer_in_near_mode_a_missing_message_is_known_and_its_uncertainty_grows_until_it_is_heard() -> None:
+    t = table()
+    t.accept(replace(message(sample(t, 2, 0.0)), due_soon=True), at(0.0))
+    assert predicted(t, 0.1)[2].uncertainty_m == LIMITS.uncertainty_m
+    assert predicted(t, 0.3)[2].uncertainty_m == pytest.approx(unheard_error_m(0.3, MOTION))
+    assert predicted(t, 0.35)[2].uncertainty_m > LIMITS.uncertainty_m + 0.3
+    assert predicted(t, 3.0)[2].uncertainty_m == LIMITS.uncertainty_m + MISSING_MAX_M
+    t.accept(replace(message(sample(t, 2, 3.0), sequence=2), due_soon=True), at(3.0))
+    assert predicted(t, 3.1)[2].uncertainty_m == LIMITS.uncertainty_m
+
+
+def test_of_any_other_peer_silence_means_nothing() -> None:
+    t = table()
+    t.accept(message(sample(t, 2, 0.0)), at(0.0))
+    assert predicted(t, 3.0)[2].uncertainty_m == LIMITS.uncertainty_m
+
+
+def test_a_peer_that_leaves_near_mode_is_not_missed() -> None:
+    t = table()
+    t.accept(replace(message(sample(t, 2, 0.0)), due_soon=True), at(0.0))
+    t.accept(message(sample(t, 2, 0.1), sequence=2), at(0.1))
+    assert predicted(t, 3.0)[2].uncertainty_m == LIMITS.uncertainty_m
+
+
+def test_what_others_pass_on_of_a_near_peer_stands_for_its_missing_message() -> None:
+    t = table()
+    t.accept(replace(message(sample(t, 2, 0.0)), due_soon=True), at(0.0))
+    t.accept(message(sample(t, 3, 0.4), digest=(sample(t, 2, 0.4),)), at(0.4))
+    assert predicted(t, 0.5)[2].uncertainty_m == LIMITS.uncertainty_m
+
+
+def test_a_lost_peer_that_spoke_in_near_mode_is_held_as_lost_and_not_as_late() -> None:
+    t = table()
+    t.accept(replace(message(sample(t, 2, 0.0)), due_soon=True), at(0.0))
+    t.presence(2, False, at(1.0))
+    n = predicted(t, 2.0)[2]
+    assert n.other_end_ned_m is not None
+    assert n.uncertainty_m == pytest.approx(LIMITS.uncertainty_m + UNCERTAINTY_GROWTH_M_S)
+
+
+def test_the_age_up_to_which_the_bound_is_certain_is_where_it_reaches_its_cap() -> None:
+    age_s = certain_age_s(LIMITS.uncertainty_m, MOTION)
+    assert unheard_error_m(age_s, MOTION) == pytest.approx(LIMITS.uncertainty_m + MISSING_MAX_M)
 
 
 # -- the lost --------------------------------------------------------------------------------------------------------

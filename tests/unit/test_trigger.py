@@ -6,11 +6,15 @@ from math import exp, inf, nextafter, sqrt
 import pytest
 
 from companion.core.hold import HoldKind, axis, weights
-from companion.core.monitor import prediction_error_bound_m
+from companion.core.monitor import PeerMotion, prediction_error_bound_m, unheard_error_m
 from companion.core.trigger import (
+    RAISED_MAX_M,
     ErrorTrigger,
+    PeriodicTrigger,
+    Situation,
     Spacing,
     SwitchingTrigger,
+    Trigger,
     exceeds,
     switching_exceeds,
     switching_threshold,
@@ -19,6 +23,11 @@ from companion.core.trigger import (
 TRIGGER = ErrorTrigger(epsilon_m=0.5, gamma_s2=0.25, kappa=0.5)
 SWITCHING = SwitchingTrigger(gamma_s2=0.5, alpha=0.75, beta=0.5, delta_min=0.25, delta_f=0.0625, eta=0.5)
 SPACING = Spacing(t_min_s=0.0625, t_max_s=8.0)
+
+MOTION = PeerMotion(
+    sigma_p_m=0.0, sigma_v_m_s=0.0, sigma_gust_m_s2=0.0, a_max_m_s2=5.0, deviation_m_s2=12.0, drift_m_s=0.0,
+    speed_m_s=8.0, latency_s=0.1, t_max_s=10.0,
+)  # fmt: skip
 
 
 def below(x: float) -> float:
@@ -148,10 +157,7 @@ def test_receiver_prediction_error_stays_below_trigger_threshold(kind: HoldKind,
 def test_with_delay_and_spacing_the_receiver_stays_within_the_stated_bound(seed: int) -> None:
     trigger = ErrorTrigger(0.3, 0.1, 0.0)
     _, at_receiver, _ = fly(seed, "damped", trigger, Spacing(0.06, 10.0), 4)
-    bound = prediction_error_bound_m(
-        epsilon_m=0.3, gamma_s2=0.1, sigma_p_m=0.0, sigma_v_m_s=0.0, sigma_gust_m_s2=0.0, a_max_m_s2=2.0,
-        latency_s=0.02 + 0.08 + 0.06,
-    )  # fmt: skip
+    bound = prediction_error_bound_m(0.3, 0.1, MOTION._replace(a_max_m_s2=2.0, latency_s=0.02 + 0.08 + 0.06))
     assert 0.3 < at_receiver <= bound
 
 
@@ -164,3 +170,65 @@ def test_the_threshold_is_compared_in_metres() -> None:
     assert sqrt(TRIGGER.epsilon_m**2) == 0.5
     assert exceeds(0.51**2, 0.0, 0.0, TRIGGER)
     assert not exceeds(0.49**2, 0.0, 0.0, TRIGGER)
+
+
+# -- each kind as an object --------------------------------------------------------------------------------------------
+
+
+def situation(**changed: float) -> Situation:
+    values = {"error_position_2": 0.0, "error_velocity_2": 0.0, "mean_residual_2": 0.0, "formation_s": 0.0}
+    return Situation(**{**values, "time_ns": 0, "sent_ns": 0, **changed})  # type: ignore[arg-type]
+
+
+def test_the_objects_fire_as_their_formulas_say() -> None:
+    assert TRIGGER.fires(situation(error_position_2=0.2525 + 1e-12, mean_residual_2=0.01))
+    assert not TRIGGER.fires(situation(error_position_2=0.2525 - 1e-12, mean_residual_2=0.01))
+    large = {"error_position_2": 0.9, "error_velocity_2": 0.0}
+    assert not SWITCHING.fires(situation(**large))
+    assert SWITCHING.fires(situation(**large, formation_s=2.0))
+
+
+@pytest.mark.parametrize("kind", [TRIGGER, SWITCHING, PeriodicTrigger(0.5)])
+def test_every_kind_states_where_its_bound_comes_from(kind: Trigger) -> None:
+    assert kind.error_bound_m(MOTION) > 0.0
+    assert kind.cause.startswith("$.trigger.")
+
+
+def test_the_threshold_bounds_the_kinds_that_look_at_the_error() -> None:
+    raised = sqrt(0.25 + RAISED_MAX_M**2)
+    assert TRIGGER.error_bound_m(MOTION) == pytest.approx(prediction_error_bound_m(raised, 0.25, MOTION))
+    assert SWITCHING.error_bound_m(MOTION) == prediction_error_bound_m(1.0, 0.5, MOTION)  # sqrt(0.75 + 0.25)
+    steady = SWITCHING._replace(delta_f=4.0)
+    assert steady.error_bound_m(MOTION) == prediction_error_bound_m(2.0, 0.5, MOTION)
+
+
+def test_the_period_bounds_the_kind_that_does_not() -> None:
+    assert PeriodicTrigger(0.5).error_bound_m(MOTION) == pytest.approx(0.5 * 12.0 * 0.6**2)
+    assert PeriodicTrigger(60.0).error_bound_m(MOTION) == unheard_error_m(10.1, MOTION)  # T_max ends any silence
+    bounds = [PeriodicTrigger(p).error_bound_m(MOTION) for p in (0.02, 0.05, 0.1, 0.5, 1.0, 5.0)]
+    assert bounds == sorted(bounds)
+    assert len(set(bounds)) == len(bounds)
+
+
+@pytest.mark.parametrize("push", [-12.0, 12.0])
+@pytest.mark.parametrize("period_s", [0.05, 0.5, 1.0])
+def test_no_vehicle_within_its_limits_gets_farther_than_the_period_allows(push: float, period_s: float) -> None:
+    """One that turns against what is predicted as hard as it can, seen just before its next message arrives."""
+    age_s = period_s + MOTION.latency_s
+    predicted_s, flown_s = 0.0, 0.5 * push * age_s**2
+    assert abs(flown_s - predicted_s) <= PeriodicTrigger(period_s).error_bound_m(MOTION) * (1 + 1e-12)
+    assert abs(flown_s - predicted_s) > 0.99 * PeriodicTrigger(period_s).error_bound_m(MOTION)
+
+
+@pytest.mark.parametrize("tick_ns", [20_000_000, 16_000_000, 23_000_000, 50_000_000])
+@pytest.mark.parametrize("period_s", [0.05, 0.1, 0.37, 1.0])
+def test_a_period_is_kept_on_average_whatever_the_control_period(tick_ns: int, period_s: float) -> None:
+    trigger, rng = PeriodicTrigger(period_s), random.Random(1)
+    sent_ns, messages, gaps = 0, 0, []
+    for k in range(1, 100_000_000_000 // tick_ns):
+        now_ns = k * tick_ns + rng.randrange(2_000_000)
+        if trigger.fires(situation(time_ns=now_ns, sent_ns=sent_ns)):
+            gaps.append(now_ns - sent_ns)
+            sent_ns, messages = now_ns, messages + 1
+    assert messages == pytest.approx(100.0 / period_s, abs=2)
+    assert max(gaps) <= period_s * 1e9 + tick_ns + 2_000_000

@@ -2,6 +2,7 @@
 
 import json
 import struct
+from dataclasses import replace
 from math import inf, nan, pi
 from typing import Any
 
@@ -30,8 +31,10 @@ times = st.integers(-(2**63), 2**63 - 1)
 singles = st.floats(-PLAUSIBLE_MAX, PLAUSIBLE_MAX, width=32)
 vectors = st.builds(Ned, singles, singles, singles)
 samples = st.builds(PeerSample, bytes_8, times, vectors, vectors, words, st.sampled_from(Phase))
+near_ids = st.sets(bytes_8, max_size=12).map(lambda ids: tuple(sorted(ids)))
 messages = st.builds(
-    PeerMessage, words, words, times, bytes_8, samples, st.lists(samples, max_size=6).map(tuple)
+    PeerMessage, words, words, times, bytes_8, samples, st.lists(samples, max_size=6).map(tuple), near_ids,
+    st.booleans(),
 )  # fmt: skip
 
 metres = st.floats(-PLAUSIBLE_MAX, PLAUSIBLE_MAX)
@@ -56,7 +59,8 @@ motions = st.builds(
 )  # fmt: skip
 
 SAMPLE = PeerSample(3, 1_700_000_000_000_000_000, Ned(1.0, 2.0, -10.0), Ned(0.5, 0.25, 0.0), 2, Phase.FORMED)
-MESSAGE = PeerMessage(7, 9, 1_700_000_000_000_000_000, 4, SAMPLE, (SAMPLE, SAMPLE))
+MESSAGE = PeerMessage(7, 9, 1_700_000_000_000_000_000, 4, SAMPLE, (SAMPLE, SAMPLE), (2, 4), True)
+FLAGS_AT = 25
 MOTION = Motion(
     revision=2, start_ns=5, issuer=3, shape="v", slots={1: SlotChange(Ned(0, 4, 0), Ned(0, 4, 0))}, blend_start_ns=1,
     blend_s=8.0, legs_start_ns=5, centre_ned_m=Ned(0.0, 0.0, -10.0), velocity_ned_m_s=Ned(0.0, 0.0, 0.0),
@@ -82,8 +86,22 @@ def test_a_state_on_the_wire_is_the_nearest_single(position: Ned) -> None:
 
 def test_a_state_costs_what_is_said_of_it() -> None:
     alone = len(encode_state(PeerMessage(0, 0, 0, 0, SAMPLE, ())))
-    assert alone == 57
-    assert len(encode_state(MESSAGE)) == alone + 2 * 38
+    assert alone == 59
+    assert len(encode_state(MESSAGE)) == alone + 2 * 38 + 2
+
+
+@pytest.mark.parametrize("near", [(4, 2), (2, 2)])
+def test_near_ids_out_of_order_or_twice_are_refused(near: tuple[int, ...]) -> None:
+    with pytest.raises(WireError, match="near ids"):
+        decode_state(encode_state(replace(MESSAGE, near_ids=near)))
+
+
+def test_a_flag_that_nobody_knows_is_refused() -> None:
+    payload = bytearray(encode_state(MESSAGE))
+    assert payload[FLAGS_AT] == 1
+    payload[FLAGS_AT] = 3
+    with pytest.raises(WireError, match="flags"):
+        decode_state(bytes(payload))
 
 
 @given(messages, st.data())
@@ -126,7 +144,7 @@ def test_any_bytes_are_a_state_or_refused(payload: bytes) -> None:
     check_state(bytes([VERSION]) + payload)
 
 
-@pytest.mark.parametrize("version", [0, 1, 255])
+@pytest.mark.parametrize("version", [0, 1, 2, 255])
 def test_a_state_of_another_version_is_refused_as_such(version: int) -> None:
     with pytest.raises(WireError, match="version"):
         decode_state(bytes([version]) + encode_state(MESSAGE)[1:])
@@ -142,7 +160,7 @@ def test_a_digest_that_lies_about_its_length_is_refused(entries: int) -> None:
 
 @pytest.mark.parametrize("phase", [len(Phase), 100, 255])
 def test_an_unknown_phase_is_refused_in_the_sample_and_in_the_digest(phase: int) -> None:
-    for at in (2, 58):
+    for at in (2, 60):
         payload = bytearray(encode_state(MESSAGE))
         payload[at] = phase
         with pytest.raises(WireError, match="phase"):
@@ -150,7 +168,7 @@ def test_an_unknown_phase_is_refused_in_the_sample_and_in_the_digest(phase: int)
 
 
 @pytest.mark.parametrize(("value", "reason"), [(nan, "finite"), (inf, "finite"), (-inf, "finite"), (3e38, "range")])
-@pytest.mark.parametrize("at", [*range(33, 57, 4), *range(71, 95, 4)])
+@pytest.mark.parametrize("at", [*range(35, 59, 4), *range(73, 97, 4)])
 def test_a_number_that_is_not_finite_or_absurd_is_refused_wherever_it_stands(
     value: float, reason: str, at: int
 ) -> None:
