@@ -251,6 +251,18 @@ def test_the_summary_has_every_promised_figure(flown: Flown) -> None:
     assert {"python", "starling-fleet", "eclipse-zenoh", "pymavlink"} <= set(summary["versions"])
 
 
+def test_the_summary_has_every_operators_command_with_its_issuer_and_answers(flown: Flown) -> None:
+    summary = json.loads(flown.out)
+    commands = summary["commands"]
+    assert [c["verb"] for c in commands] == ["takeoff", "motion", "motion", "motion", "land"]
+    for c in commands:
+        assert (c["accepted"], c["refused"], c["unanswered"]) == (flown.fleet.ids, {}, [])
+        assert c["issuer"].startswith("operator-")
+    assert [c["revision"] for c in commands] == [1, 2, 3, 4, 5]
+    assert summary["commands_left_out"] == 5  # garbage that vehicle 1 got
+    assert summary["killed"] == summary["unrecorded"] == summary["autopilots_lost"] == {}
+
+
 def test_every_companions_decisions_replay_byte_for_byte(flown: Flown) -> None:
     for i in flown.fleet.ids[1:]:
         result = replay_file(flown.folder / f"vehicle-{i}.mcap")
