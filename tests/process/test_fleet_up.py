@@ -51,7 +51,13 @@ from companion.core.failsafe import Failsafe
 from companion.core.frames import Ned
 from companion.core.values import PeerMessage, PeerSample, Phase
 from companion.io.recorder import read_recording
-from companion.io.zenoh_peers import PeerNetworkSettings, scouting_port, zenoh_configuration
+from companion.io.zenoh_peers import (
+    PUTS_HZ,
+    REQUESTS_HZ,
+    PeerNetworkSettings,
+    scouting_port,
+    zenoh_configuration,
+)
 from companion.operate import Operator
 from companion.replay import replay_file
 from companion.wire.mavlink import Px4Mode, dialect
@@ -162,8 +168,9 @@ def put_garbage(fleet: Fleet) -> None:
         assert eventually(lambda: len(session.info.peers_zid()) >= len(fleet.ids))
         for key, payload in puts:
             session.put(key, payload)
-            time.sleep(0.02)
+            time.sleep(2.0 / PUTS_HZ["plan"])  # more often they are left out
         for command in (b"[" * 60_000, b"{", b"\xff\xfe", b'{"verb": 3}', b'{"verb": "motion", "motion": {"a": NaN}}'):
+            time.sleep(2.0 / REQUESTS_HZ)
             answers = session.get("fleet/1/command", payload=command, timeout=5.0)
             assert [json.loads(a.ok.payload.to_bytes())["accepted"] for a in answers if a.ok] == [False]
         token.undeclare()  # type: ignore[no-untyped-call]
