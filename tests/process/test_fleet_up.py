@@ -52,7 +52,7 @@ from companion.core.frames import Ned
 from companion.core.values import PeerMessage, PeerSample, Phase
 from companion.io.recorder import read_recording
 from companion.io.zenoh_peers import (
-    PUTS_HZ,
+    PLANS_HZ,
     REQUESTS_HZ,
     PeerNetworkSettings,
     scouting_port,
@@ -168,7 +168,7 @@ def put_garbage(fleet: Fleet) -> None:
         assert eventually(lambda: len(session.info.peers_zid()) >= len(fleet.ids))
         for key, payload in puts:
             session.put(key, payload)
-            time.sleep(2.0 / PUTS_HZ["plan"])  # more often they are left out
+            time.sleep(2.0 / PLANS_HZ)  # more often they are left out
         for command in (b"[" * 60_000, b"{", b"\xff\xfe", b'{"verb": 3}', b'{"verb": "motion", "motion": {"a": NaN}}'):
             time.sleep(2.0 / REQUESTS_HZ)
             answers = session.get("fleet/1/command", payload=command, timeout=5.0)
