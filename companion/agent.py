@@ -71,6 +71,8 @@ RESEND_NS = (250_000_000, 1_000_000_000)
 OUT_OF_FORMATION = frozenset({Phase.IDLE, Phase.APART, Phase.LANDING, Phase.LANDED, Phase.RELEASED})
 """phases of peers for which nobody waits any more once the formation has been taken"""
 LEVEL_M_S = 1e-6
+FAILSAFES_TOLD_MOST = 20
+"""the last ones stand in a status: one that comes again and again must not make it too large to be sent"""
 RESENDS_MAX = 8
 CATCH_UP_NS = 1_000_000_000
 SPREAD_NS = 50_000_000
@@ -778,7 +780,7 @@ class Agent:
             "battery_percent": self.autopilot.battery(now),
             "autopilot_age_s": self.autopilot.heartbeat_age_s(now),
             "configuration": self.config.shared_hash,
-            "failsafes": list(self.flight.failsafes),
+            "failsafes": self.flight.failsafes[-FAILSAFES_TOLD_MOST:],
             "rejected": dict(
                 self.rejected + self.flight.counts + self.peers.rejected + self.link.rejected + self.autopilot.counts
             ),

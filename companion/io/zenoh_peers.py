@@ -67,8 +67,9 @@ STATE_MAX_BYTES: Final = 16_384
 """above the largest state with a digest of 255 entries"""
 QUESTION_MAX_BYTES: Final = 1024
 """of a question that is no command"""
-PUTS_HZ: Final = {STATE_TOPIC: 100.0, PLAN_TOPIC: 20.0}
-"""how often a session hears each topic from one other session at most; the rest is left out before Python sees it"""
+PLANS_HZ: Final = 20.0
+"""how often a session hears a plan from one other session at most; the rest is left out before Python sees it. Not so
+for states: of what a stalled link delivers at once the oldest alone would be heard, and nobody repeats a state soon"""
 REQUESTS_HZ: Final = 50.0
 """the same for each kind of question"""
 ASK_INTERVAL_S: Final = 0.03
@@ -175,7 +176,7 @@ def _flood_limits(fleet_name: str, vehicle_id: int) -> dict[str, Any]:
     def question(kind: str) -> str:
         return f"{fleet_name}/fleet/{vehicle_id}/{kind}"
 
-    puts = [{"key_expr": topic(name), "freq": hz} for name, hz in PUTS_HZ.items()]
+    puts = [{"key_expr": topic(PLAN_TOPIC), "freq": PLANS_HZ}]
     queries = [{"key_expr": question(kind), "freq": REQUESTS_HZ} for kind in REQUEST_KINDS]
     sizes = [
         ("state", ["put", "reply"], [topic(STATE_TOPIC)], STATE_MAX_BYTES),

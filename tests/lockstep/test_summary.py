@@ -276,6 +276,23 @@ def test_a_vehicle_that_is_killed_where_it_stands_disarmed_is_not_killed() -> No
     assert check(f)["killed"] == {}
 
 
+def test_a_vehicle_killed_as_it_takes_off_is_killed_until_its_next_take_off_and_the_summary_remembers() -> None:
+    f = flown(fleet(1, legs=straight(3.0)))
+    until(f.ls, 10.0, lambda: f.ls.all_in(Phase.CLIMBING))
+    f.ls.command(b'{"verb":"kill","confirm":true}')
+    until(f.ls, 10.0, lambda: not f.ls.vehicles[1].autopilot.truth().armed and f.ls.all_in(Phase.LANDED, Phase.IDLE))
+    wait(f.ls, 12.0)
+    assert f.ls.vehicles[1].agent.status(f.ls.now)["killed"] == "killed by command"
+    assert json.loads(f.ls.command(b'{"verb":"takeoff"}')[1])["accepted"]
+    wait(f.ls, 1.0)
+    assert f.ls.vehicles[1].agent.status(f.ls.now)["killed"] is None
+    until(f.ls, 60.0, lambda: f.ls.all_in(Phase.MOVING))
+    until_landed(f.ls)
+    summary = check(f)
+    assert summary["killed"] == {1: "killed by command"}
+    assert not_met(summary) == {"vehicles killed"}
+
+
 def test_a_vehicle_that_landed_while_the_others_were_still_forming_ends_what_is_steady() -> None:
     f = flown(fleet(COUNT, legs=straight(600.0)))
     until(f.ls, 60.0, lambda: f.ls.all_in(Phase.FORMING, Phase.FORMED) and not f.ls.all_in(Phase.FORMING))

@@ -51,7 +51,13 @@ from companion.core.failsafe import Failsafe
 from companion.core.frames import Ned
 from companion.core.values import PeerMessage, PeerSample, Phase
 from companion.io.recorder import read_recording
-from companion.io.zenoh_peers import PeerNetworkSettings, scouting_port, zenoh_configuration
+from companion.io.zenoh_peers import (
+    PLANS_HZ,
+    REQUESTS_HZ,
+    PeerNetworkSettings,
+    scouting_port,
+    zenoh_configuration,
+)
 from companion.operate import Operator
 from companion.replay import replay_file
 from companion.wire.mavlink import Px4Mode, dialect
@@ -162,8 +168,9 @@ def put_garbage(fleet: Fleet) -> None:
         assert eventually(lambda: len(session.info.peers_zid()) >= len(fleet.ids))
         for key, payload in puts:
             session.put(key, payload)
-            time.sleep(0.02)
+            time.sleep(2.0 / PLANS_HZ)  # more often they are left out
         for command in (b"[" * 60_000, b"{", b"\xff\xfe", b'{"verb": 3}', b'{"verb": "motion", "motion": {"a": NaN}}'):
+            time.sleep(2.0 / REQUESTS_HZ)
             answers = session.get("fleet/1/command", payload=command, timeout=5.0)
             assert [json.loads(a.ok.payload.to_bytes())["accepted"] for a in answers if a.ok] == [False]
         token.undeclare()  # type: ignore[no-untyped-call]
@@ -249,6 +256,18 @@ def test_the_summary_has_every_promised_figure(flown: Flown) -> None:
         assert isinstance(value, (int, float)), path
     assert isinstance(summary["rejected"], dict)
     assert {"python", "starling-fleet", "eclipse-zenoh", "pymavlink"} <= set(summary["versions"])
+
+
+def test_the_summary_has_every_operators_command_with_its_issuer_and_answers(flown: Flown) -> None:
+    summary = json.loads(flown.out)
+    commands = summary["commands"]
+    assert [c["verb"] for c in commands] == ["takeoff", "motion", "motion", "motion", "land"]
+    for c in commands:
+        assert (c["accepted"], c["refused"], c["unanswered"]) == (flown.fleet.ids, {}, [])
+        assert c["issuer"].startswith("operator-")
+    assert [c["revision"] for c in commands] == [1, 2, 3, 4, 5]
+    assert summary["commands_left_out"] == 5  # garbage that vehicle 1 got
+    assert summary["killed"] == summary["unrecorded"] == summary["autopilots_lost"] == {}
 
 
 def test_every_companions_decisions_replay_byte_for_byte(flown: Flown) -> None:
