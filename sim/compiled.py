@@ -1,6 +1,6 @@
-"""A compiled copy of the code that flies in lockstep, for studies of hundreds of flights: `python -m sim.compiled FOLDER`.
+"""A compiled copy of the code that flies in lockstep, for hundreds of flights: `python -m sim.compiled FOLDER`.
 
-mypyc makes C of the typed sources as they are, so a flight is the same to the last bit and takes about 40 % of the time.
+mypyc makes C of the typed sources as they are: a flight is the same to the last bit and takes about half of the time.
 """
 
 import os
