@@ -16,6 +16,7 @@ from companion.config import FleetConfig, parse
 from companion.core.failsafe import Failsafe
 from companion.core.safety import COLLISION_DISTANCE_M as COLLISION_M
 from companion.core.values import FLYING_PHASES, Instant, Phase
+from companion.errors import ConfigError
 from companion.flight import ON_GROUND
 from companion.wire.mavlink import Px4Mode
 from sim.lockstep import Lockstep, Vehicle
@@ -81,6 +82,10 @@ class Flight:
     faults_from_s: float
     faults_to_s: float
     most_faults: int
+    kinds: tuple[str, ...]
+    """that are drawn; none named: all"""
+    operator_s: float
+    """after the take-off command: an operator lands who flies still, in flights with a forged plan"""
     loss: float
     delay_s: float
     fence_radius_m: float
@@ -103,8 +108,13 @@ class Drawn:
 
 
 def flight_of(config: Config) -> Flight:
-    """The set-up's flight; a missing or unknown key is refused."""
-    return table_of(config, "flight", Flight)
+    """The set-up's flight; a missing or unknown key is refused, and a kind that there is not."""
+    flight = table_of(config, "flight", Flight)
+    if unknown := sorted(set(flight.kinds) - set(EXPLAINED)):
+        raise ConfigError(
+            f"{config.name}.toml: $.flight.kinds: there is no {', '.join(unknown)}; known are {', '.join(EXPLAINED)}"
+        )
+    return flight
 
 
 def drawn_faults(flight: Flight, seed: int) -> list[Drawn]:
@@ -115,7 +125,7 @@ def drawn_faults(flight: Flight, seed: int) -> list[Drawn]:
     """
     faults = []
     for k in range(Random(f"campaign/{seed}").randint(1, flight.most_faults)):
-        kind = max(sorted(EXPLAINED), key=lambda kind: Random(f"campaign/{seed}/{k}/{kind}").random())
+        kind = max(sorted(flight.kinds or EXPLAINED), key=lambda kind: Random(f"campaign/{seed}/{k}/{kind}").random())
         random = Random(f"campaign/{seed}/{k}")
         at_s = random.uniform(flight.faults_from_s, flight.faults_to_s)
         i = random.randint(1, flight.vehicles)
@@ -272,9 +282,9 @@ def fly(flight: Flight, seed: int, tell: Callable[[str], None] = lambda _: None)
     if len(answers) < flight.vehicles or not all(a["accepted"] for a in answers.values()):
         raise RuntimeError(f"seed {seed}: the take-off is refused before any fault: {answers}")
     began_s = ls.now_ns * 1e-9
-    raised = ""
+    raised, landed = "", False
     try:
-        _suffer(ls, flight, faults, began_s, Random(f"campaign/{seed}/parts"), ear)
+        landed = _suffer(ls, flight, faults, began_s, Random(f"campaign/{seed}/parts"), ear)
     except Exception as error:  # noqa: BLE001 - whatever an agent raises ends its companion: that is what is looked for
         at = traceback.extract_tb(error.__traceback__)[-1]
         raised = f"{type(error).__name__}: {error} ({Path(at.filename).name}:{at.lineno})"
@@ -286,6 +296,7 @@ def fly(flight: Flight, seed: int, tell: Callable[[str], None] = lambda _: None)
         **_distances(ls, faults, began_s),
         **_breach(ls, faults, flight, began_s),
         "raised": raised,
+        "operator_landed": landed,
         "stuck": [] if raised else _stuck(ls),
         "left_in_hold": [i for i, v in ls.vehicles.items() if _orphan(v)],
         "unexplained": [(s, i, what.value) for s, i, what in failsafes if not _explained((s, i, what), faults)],
@@ -298,21 +309,32 @@ def fly(flight: Flight, seed: int, tell: Callable[[str], None] = lambda _: None)
 
 def _suffer(
     ls: Lockstep, flight: Flight, faults: Sequence[Drawn], began_s: float, random: Random, ear: _Ear
-) -> None:  # fmt: skip
-    """Fly to the end with the faults at their times."""
+) -> bool:  # fmt: skip
+    """Fly to the end with the faults at their times; returns whether it took an operator to bring everybody down.
+
+    A forged plan that keeps all rules is flown, and it may have no end: whoever reads it on a screen commands to land.
+    """
     moments = [moment for fault in faults for moment in _moments(fault, flight.seconds)]
+    if any(f.kind == "forged_plan" for f in faults):
+        moments.append((flight.operator_s, "land", faults[0]))
+    landed = False
     for at_s, what, fault in sorted(moments, key=lambda m: m[0]):
         if at_s >= flight.seconds:
             break
-        told_again = at_s > fault.at_s and what == "begin"
-        ls.run_until(began_s + at_s, (lambda: not _stuck(ls)) if told_again else None)
-        if told_again and not _stuck(ls):
-            continue  # the flight is over, and lies about it change nothing
-        if what == "heal":
-            _heal(ls, fault, faults, at_s)
-        else:
-            _inject(ls, fault, random, ear)
+        later = at_s > max(f.at_s for f in faults)
+        ls.run_until(began_s + at_s, (lambda: not _stuck(ls)) if later else None)
+        if later and not _stuck(ls):
+            break  # all faults have come, and the flight is over
+        match what:
+            case "heal":
+                _heal(ls, fault, faults, at_s)
+            case "land":
+                ls.command(b'{"verb":"land"}')
+                landed = True
+            case _:
+                _inject(ls, fault, random, ear)
     ls.run_until(began_s + flight.seconds, lambda: not _stuck(ls))
+    return landed
 
 
 def _stuck(ls: Lockstep) -> list[list[Any]]:
@@ -424,6 +446,11 @@ def finish(config: Config, pieces: Sequence[Record], seeds: Sequence[int]) -> Ou
         "what": "a vehicle ended in its autopilot's hold or with its pilot: taken over, mute, companion ended "
         "or started anew (not judged)",
         "flights": proportion_text(sum(held), n), "count": sum(held),
+    })  # fmt: skip
+    landed = [bool(p["operator_landed"]) for p in pieces]
+    rows.append({
+        "what": "an operator landed those whom a forged plan within all rules kept in the air (not judged)",
+        "flights": proportion_text(sum(landed), n), "count": sum(landed),
     })  # fmt: skip
     rows += [
         {"what": what, "flights": proportion_text(sum(p[key] for p in pieces), n), "count": sum(p[key] for p in pieces)}

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from companion.errors import CompanionError
+from companion.errors import CompanionError, ConfigError
 from sim.study import campaign
 from sim.study.attacks import PLANS
 from sim.study.campaign import Drawn, drawn_faults, flight_of, fly
@@ -91,3 +91,19 @@ def test_a_message_that_ends_a_companion_breaks_a_rule_and_says_where() -> None:
     outcome = campaign.finish(load_config("campaign"), [record], [seed])
     assert outcome.broken == f"1 of 1 flights broke a rule, of seeds {seed}"
     assert outcome.values["flights"][0]["seed"] == seed
+
+
+def test_an_endless_plan_of_a_stranger_keeps_nobody_in_the_air_for_ever() -> None:
+    flight = replace(flight_of(load_config("campaign")), vehicles=2, kinds=("forged_plan",), operator_s=45.0)
+    seed = next(s for s in range(1000) if [f.magnitude for f in drawn_faults(flight, s)] == ["endless"])
+    record = fly(flight, seed)
+    assert record["raised"] == ""
+    assert record["stuck"] == []
+    assert record["operator_landed"] == (record["ended_after_s"] > 45.0)
+
+
+def test_a_set_up_may_name_the_kinds_it_wants_and_none_that_there_is_not(tmp_path: Path) -> None:
+    flight = replace(flight_of(load_config("campaign")), kinds=("killed", "mute"))
+    assert {f.kind for seed in range(50) for f in drawn_faults(flight, seed)} == {"killed", "mute"}
+    with pytest.raises(ConfigError, match=r"kinds: there is no eclipse; known are gps_lost, .*forged_digest"):
+        _fly(tmp_path, "0", {"kinds = []": 'kinds = ["eclipse"]'})
