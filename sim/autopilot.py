@@ -166,9 +166,9 @@ class Autopilot:
             # What comes many times a second is read without pymavlink's objects; what is damaged goes the long way.
             values = unpacked(SETPOINT, datagram)
             if values is not None:
-                message = SetpointFields(*values)
-                if self._addressed(message):
-                    self._take_setpoint(message)
+                asked = SetpointFields(*values)
+                if self._addressed(asked):
+                    self._take_setpoint(asked)
                 return
         for message in self.link.mav.parse_buffer(datagram) or ():
             if message.get_type() == "BAD_DATA":
@@ -446,35 +446,35 @@ class Autopilot:
 
     def _handle(self, message: Any) -> None:
         services = self._services
-        match message:
-            case mavlink.MAVLink_timesync_message():
+        match message.get_type():
+            case "TIMESYNC":
                 services.synchronise(message)
-            case mavlink.MAVLink_ping_message():
+            case "PING":
                 services.ping(message)
-            case mavlink.MAVLink_set_mode_message():
+            case "SET_MODE":
                 if message.target_system == self.telemetry.system_id:
                     custom = message.custom_mode
                     set_mode(self, message.base_mode, custom >> 16 & 0xFF, custom >> 24 & 0xFF)
             case _ if hasattr(message, "target_system") and not self._addressed(message):
                 pass  # somebody else's
-            case mavlink.MAVLink_set_position_target_local_ned_message():
+            case "SET_POSITION_TARGET_LOCAL_NED":
                 self._take_setpoint(message)
-            case mavlink.MAVLink_command_long_message() | mavlink.MAVLink_command_int_message():
+            case "COMMAND_LONG" | "COMMAND_INT":
                 self._take_command(message)
-            case mavlink.MAVLink_param_request_list_message():
+            case "PARAM_REQUEST_LIST":
                 services.list_parameters()
-            case mavlink.MAVLink_param_request_read_message():
+            case "PARAM_REQUEST_READ":
                 services.read_parameter(message)
-            case mavlink.MAVLink_param_set_message():
+            case "PARAM_SET":
                 if not services.set_parameter(message):
                     self._reject("parameter")
-            case mavlink.MAVLink_mission_request_list_message():
+            case "MISSION_REQUEST_LIST":
                 services.count_mission(message)
-            case mavlink.MAVLink_mission_count_message() if message.count > 0:
+            case "MISSION_COUNT" if message.count > 0:
                 services.refuse_mission(message)
-            case mavlink.MAVLink_mission_count_message() | mavlink.MAVLink_mission_clear_all_message():
+            case "MISSION_COUNT" | "MISSION_CLEAR_ALL":
                 services.clear_mission(message)
-            case mavlink.MAVLink_file_transfer_protocol_message():
+            case "FILE_TRANSFER_PROTOCOL":
                 services.refuse_file_transfer(message)
 
     def _take_setpoint(self, message: Any) -> None:

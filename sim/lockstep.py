@@ -112,6 +112,8 @@ class Lockstep:
     """(topic, receiver): puts that do not arrive, while presence and everything else does"""
     _twins: dict[int, Agent] = field(default_factory=dict)
     """second companions, by the id that they share"""
+    _twin_line: dict[int, int] = field(default_factory=dict)
+    """twin's id -> vehicle on whose autopilot's line it is"""
     _orders: int = 0
     """revision of the last command that came without one"""
     _touched: set[int] = field(default_factory=set)
@@ -215,13 +217,14 @@ class Lockstep:
         return self.now_ns >= self._line_dead_until_ns.get(i, 0)
 
     def _to_companion(self, i: int, datagrams: Iterable[bytes]) -> None:
-        v, twin, now = self.vehicles[i], self._twins.get(i), self.now
+        v, now = self.vehicles[i], self.now
+        twins = [self._twins[k] for k, line in self._twin_line.items() if line == i] if self._twins else ()
         self._touched.add(i)
         for datagram in datagrams:
             if v.alive:
                 self._log(i, "input/mavlink", datagram)
                 v.agent.receive_mavlink(datagram, now)
-            if twin is not None:
+            for twin in twins:
                 twin.receive_mavlink(datagram, now)
 
     def _to_autopilot(self, i: int, datagrams: Iterable[bytes]) -> None:
@@ -254,9 +257,10 @@ class Lockstep:
 
     def _send(self, i: int, out: Outputs, sender: Agent) -> None:
         """What a companion sends goes on its ways, to its autopilot and to all who hear."""
-        if out.mavlink and self._line_works(i):
+        line = self._twin_line[i] if sender is self._twins.get(i) else i
+        if out.mavlink and self._line_works(line):
             arrival_ns = self.now_ns + LINK_DELAY_NS + round(self.command_delay_s * 1e9)
-            self._at(arrival_ns, self._to_autopilot, i, out.mavlink)
+            self._at(arrival_ns, self._to_autopilot, line, out.mavlink)
         for topic, payload in out.peers:
             key = f"fleet/{i}/{topic}"
             if i in self._twins:
@@ -355,10 +359,19 @@ class Lockstep:
         for j in receivers or [j for j in self.vehicles if str(j) != own]:
             self._to_peer(j, key, payload)
 
-    def add_twin(self, i: int) -> Agent:
-        """A second companion under vehicle i's id, on the same autopilot's line, as behind a MAVLink router."""
+    def add_twin(self, i: int, line_of: int | None = None) -> Agent:
+        """A second companion under vehicle i's id, on the same autopilot's line, as behind a MAVLink router.
+
+        Or on the line of another vehicle's autopilot, as when it is started on the wrong vehicle's computer.
+        """
+        self._twin_line[i] = i if line_of is None else line_of
         self._twins[i] = Agent(self.config, i, boot_id=Random(f"{self.seed}/{i}/twin/{self.now_ns}").getrandbits(32))
         return self._twins[i]
+
+    def remove_twin(self, i: int) -> None:
+        """The second companion ends."""
+        self._twins.pop(i, None)
+        self._twin_line.pop(i, None)
 
     def phases(self) -> dict[int, Phase]:
         """Each running companion's phase."""

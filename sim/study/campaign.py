@@ -1,9 +1,12 @@
 """Fault campaign: whole flights of ten real agents in lockstep, one to three faults each, drawn by the seed."""
 
 import json
+import sys
+import traceback
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from random import Random
 from typing import Any
 
@@ -12,13 +15,15 @@ import numpy as np
 from companion.config import FleetConfig, parse
 from companion.core.failsafe import Failsafe
 from companion.core.safety import COLLISION_DISTANCE_M as COLLISION_M
-from companion.core.values import FLYING_PHASES, Phase
+from companion.core.values import FLYING_PHASES, Instant, Phase
+from companion.errors import ConfigError
 from companion.flight import ON_GROUND
 from companion.wire.mavlink import Px4Mode
 from sim.lockstep import Lockstep, Vehicle
 from sim.network import NetworkParameters
 from sim.px4.faults import Fault, FaultKind
-from sim.study.common import FLYING_CODE, Column, Config, Outcome, Record, Table, proportion_text, table_of
+from sim.study.attacks import PLANS, STATES, forged_plan, forged_state
+from sim.study.common import FLYING_CODE, Column, Config, Outcome, Record, Table, load_config, proportion_text, table_of
 
 TITLE = "Fault campaign: flights with one to three faults each"
 SOURCES = FLYING_CODE
@@ -50,10 +55,19 @@ EXPLAINED: dict[str, frozenset[Failsafe]] = {
         "restarted": set(),
         "stalled": {_F.AUTOPILOT},
         "partition": set(),
+        "states_lost": set(),
+        "restarted_without_line": set(),
+        "second_companion": set(),
+        "forged_plan": set(),
+        "forged_digest": set(),
     }.items()
 }
 """fault -> the failsafes of the same vehicle that it explains, from when it comes on. Who falls strikes the ground; who
 hovers where its frozen position is not believes that a pilot ended its climb."""
+NETWORK_KINDS = frozenset({"partition"})
+"""of the network as a whole, and of no vehicle"""
+FORGED_EVERY_S = 0.5
+"""a lie is told again and again"""
 FALLS = frozenset({"rc_kill", "reboot"})
 """the motors stop"""
 
@@ -68,6 +82,10 @@ class Flight:
     faults_from_s: float
     faults_to_s: float
     most_faults: int
+    kinds: tuple[str, ...]
+    """that are drawn; none named: all"""
+    operator_s: float
+    """after the take-off command: an operator lands who flies still, in flights with a forged plan"""
     loss: float
     delay_s: float
     fence_radius_m: float
@@ -85,25 +103,52 @@ class Drawn:
     """0: the network"""
     kind: str
     duration_s: float
-    magnitude: float | None = None
+    magnitude: float | str | None = None
+    """how much; or in which way, where a kind has several"""
 
 
 def flight_of(config: Config) -> Flight:
-    """The set-up's flight; a missing or unknown key is refused."""
-    return table_of(config, "flight", Flight)
+    """The set-up's flight; a missing or unknown key is refused, and a kind that there is not."""
+    flight = table_of(config, "flight", Flight)
+    if unknown := sorted(set(flight.kinds) - set(EXPLAINED)):
+        raise ConfigError(
+            f"{config.name}.toml: $.flight.kinds: there is no {', '.join(unknown)}; known are {', '.join(EXPLAINED)}"
+        )
+    return flight
 
 
 def drawn_faults(flight: Flight, seed: int) -> list[Drawn]:
-    """The faults of a seed, in the order of their times."""
-    random = Random(f"campaign/{seed}")
+    """The faults of a seed, in the order of their times.
+
+    Every fault draws from a stream of its own, and its kind is the one whose own number is largest: another kind
+    changes those faults alone that become of it, and in which order the kinds are written changes nothing.
+    """
     faults = []
-    for _ in range(random.randint(1, flight.most_faults)):
-        kind = random.choice(tuple(EXPLAINED))
-        i = 0 if kind == "partition" else random.randint(1, flight.vehicles)
-        magnitude = {"noise": random.uniform(0.2, 1.0), "low_battery": random.choice((0.05, 0.15))}.get(kind)
+    for k in range(Random(f"campaign/{seed}").randint(1, flight.most_faults)):
+        kind = max(sorted(flight.kinds or EXPLAINED), key=lambda kind: Random(f"campaign/{seed}/{k}/{kind}").random())
+        random = Random(f"campaign/{seed}/{k}")
         at_s = random.uniform(flight.faults_from_s, flight.faults_to_s)
-        faults.append(Drawn(at_s, i, kind, random.choice((0.7, 3.0, 10.0, 1000.0)), magnitude))
+        i = random.randint(1, flight.vehicles)
+        duration_s = random.choice((0.7, 3.0, 10.0, 1000.0))
+        faults.append(Drawn(at_s, 0 if kind in NETWORK_KINDS else i, kind, duration_s, _magnitude(kind, random)))
     return sorted(faults, key=lambda f: f.at_s)
+
+
+def _magnitude(kind: str, random: Random) -> float | str | None:
+    match kind:
+        case "noise":
+            return random.uniform(0.2, 1.0)
+        case "low_battery":
+            return random.choice((0.05, 0.15))
+        case "states_lost":
+            return random.choice(("by one: states", "by one: states and plans", "by all: states"))
+        case "second_companion":
+            return random.choice(("on its line", "on another's line"))
+        case "forged_plan":
+            return random.choice(tuple(PLANS))
+        case "forged_digest":
+            return random.choice(tuple(STATES))
+    return None
 
 
 def _fleet(flight: Flight, missing: str) -> FleetConfig:
@@ -135,9 +180,71 @@ def _fleet(flight: Flight, missing: str) -> FleetConfig:
     )
 
 
-def _inject(ls: Lockstep, fault: Drawn, random: Random) -> None:
+@dataclass(frozen=True, slots=True)
+class _Ear:
+    """Who listens on the network: the last state that each vehicle told."""
+
+    heard: dict[int, bytes]
+
+    def listen(self, i: int, channel: str, _: Instant, body: bytes) -> None:
+        """To every input and output of every agent; only states that are sent are kept."""
+        if channel == "output/peer" and body.startswith(b"state\0"):
+            self.heard[i] = body[6:]
+
+
+def _moments(fault: Drawn, end_s: float) -> list[tuple[float, str, Drawn]]:
+    """When something is done of a fault: it begins, is told again where it is a lie, and is healed."""
+    ends_s = fault.at_s + fault.duration_s
+    moments = [(fault.at_s, "begin", fault)]
+    if fault.kind == "forged_digest":
+        times = int((min(ends_s, end_s) - fault.at_s) / FORGED_EVERY_S)
+        moments += [(fault.at_s + k * FORGED_EVERY_S, "begin", fault) for k in range(1, times + 1)]
+    if fault.kind in ("partition", "states_lost", "second_companion"):
+        moments.append((ends_s, "heal", fault))
+    return moments
+
+
+def _heal(ls: Lockstep, fault: Drawn, faults: Sequence[Drawn], at_s: float) -> None:
+    match fault.kind:
+        case "partition":
+            ls.partition()
+        case "second_companion":
+            ls.remove_twin(fault.vehicle_id)
+        case "states_lost":
+            ls.restore_topics()
+            for other in faults:
+                if other.kind == "states_lost" and other.at_s <= at_s < other.at_s + other.duration_s:
+                    _lose_states(ls, other)
+
+
+def _lose_states(ls: Lockstep, fault: Drawn) -> None:
+    way = str(fault.magnitude)
+    receivers = (fault.vehicle_id,) if way.startswith("by one") else ()
+    ls.drop_topic("state", *receivers)
+    if way.endswith("plans"):
+        ls.drop_topic("plan", *receivers)
+
+
+def _inject(ls: Lockstep, fault: Drawn, random: Random, ear: _Ear) -> None:
     i = fault.vehicle_id
     match fault.kind:
+        case "states_lost":
+            _lose_states(ls, fault)
+        case "restarted_without_line":
+            if ls.vehicles[i].alive:
+                ls.kill(i)
+                ls.restart(i, line_dead_s=fault.duration_s)
+        case "second_companion":
+            others = [j for j in ls.vehicles if j != i]
+            ls.add_twin(i, line_of=random.choice(others) if fault.magnitude == "on another's line" else None)
+        case "forged_plan":
+            newest = max((v.agent.programme.newest for v in ls.vehicles.values()), key=lambda motion: motion.order)
+            payload = forged_plan(str(fault.magnitude), newest, i, ls.now.fleet_ns, random)
+            ls.inject_peer(f"fleet/{i}/plan", payload)
+        case "forged_digest":
+            lie = forged_state(str(fault.magnitude), ear.heard, i, ls.now.fleet_ns, random)
+            if lie is not None:
+                ls.inject_peer(f"fleet/{i}/state", lie)
         case "killed":
             if ls.vehicles[i].alive:
                 ls.kill(i)
@@ -153,36 +260,44 @@ def _inject(ls: Lockstep, fault: Drawn, random: Random) -> None:
             cut = random.randint(1, len(ids) - 1)
             ls.partition(ids[:cut], ids[cut:])
         case kind:
+            assert not isinstance(fault.magnitude, str)
             ls.vehicles[i].autopilot.inject(Fault(FaultKind(kind), fault.magnitude, fault.duration_s))
 
 
-def fly(flight: Flight, seed: int) -> Record:
-    """One flight from take-off to the end of the last vehicle's; what was seen of it."""
+def fly(flight: Flight, seed: int, tell: Callable[[str], None] = lambda _: None) -> Record:
+    """One flight from take-off to the end of the last vehicle's; what was seen of it.
+
+    `tell` is given a line for everything that happened.
+    """
     config = _fleet(flight, Random(f"campaign/{seed}/missing").choice(("land", "continue")))
-    ls = Lockstep(config, seed=seed, network=NetworkParameters(delay_s=flight.delay_s, loss=flight.loss))
+    faults = drawn_faults(flight, seed)
+    ear = _Ear({})
+    lies = any(f.kind == "forged_digest" for f in faults)
+    ls = Lockstep(
+        config, seed=seed, network=NetworkParameters(delay_s=flight.delay_s, loss=flight.loss),
+        record=ear.listen if lies else None,
+    )  # fmt: skip
     ls.run_until(READY_S, lambda: not any(v.agent.unready(ls.now) for v in ls.vehicles.values()))
     answers = {i: json.loads(a) for i, a in ls.command(b'{"verb":"takeoff"}').items()}
     if len(answers) < flight.vehicles or not all(a["accepted"] for a in answers.values()):
         raise RuntimeError(f"seed {seed}: the take-off is refused before any fault: {answers}")
     began_s = ls.now_ns * 1e-9
-    random = Random(f"campaign/{seed}/parts")
-    faults = drawn_faults(flight, seed)
-    orders = [(f.at_s, "begin", f) for f in faults]
-    orders += [(f.at_s + f.duration_s, "heal", f) for f in faults if f.kind == "partition"]
-    for at_s, what, fault in sorted(orders, key=lambda o: o[0]):
-        if at_s < flight.seconds:
-            ls.run_until(began_s + at_s)
-            if what == "heal":
-                ls.partition()
-            else:
-                _inject(ls, fault, random)
-    ls.run_until(began_s + flight.seconds, lambda: not _stuck(ls))
+    raised, landed = "", False
+    try:
+        landed = _suffer(ls, flight, faults, began_s, Random(f"campaign/{seed}/parts"), ear)
+    except Exception as error:  # noqa: BLE001 - whatever an agent raises ends its companion: that is what is looked for
+        at = traceback.extract_tb(error.__traceback__)[-1]
+        raised = f"{type(error).__name__}: {error} ({Path(at.filename).name}:{at.lineno})"
+    for s, i, note in ls.notes:
+        tell(f"{s - began_s:8.2f} s  vehicle {i}: {note}")
     failsafes = [(round(s - began_s, 3), i, what) for s, i, what in _failsafes(ls)]
     return {
         "faults": [[round(f.at_s, 3), f.vehicle_id, f.kind, f.duration_s, f.magnitude] for f in faults],
         **_distances(ls, faults, began_s),
         **_breach(ls, faults, flight, began_s),
-        "stuck": _stuck(ls),
+        "raised": raised,
+        "operator_landed": landed,
+        "stuck": [] if raised else _stuck(ls),
         "left_in_hold": [i for i, v in ls.vehicles.items() if _orphan(v)],
         "unexplained": [(s, i, what.value) for s, i, what in failsafes if not _explained((s, i, what), faults)],
         "failsafes": [(s, i, what.value) for s, i, what in failsafes],
@@ -190,6 +305,36 @@ def fly(flight: Flight, seed: int) -> Record:
         "flew_the_plan": any("-> moving" in note for _, _, note in ls.notes),
         "ended_after_s": ls.now_ns * 1e-9 - began_s,
     }
+
+
+def _suffer(
+    ls: Lockstep, flight: Flight, faults: Sequence[Drawn], began_s: float, random: Random, ear: _Ear
+) -> bool:  # fmt: skip
+    """Fly to the end with the faults at their times; returns whether it took an operator to bring everybody down.
+
+    A forged plan that keeps all rules is flown, and it may have no end: whoever reads it on a screen commands to land.
+    """
+    moments = [moment for fault in faults for moment in _moments(fault, flight.seconds)]
+    if any(f.kind == "forged_plan" for f in faults):
+        moments.append((flight.operator_s, "land", faults[0]))
+    landed = False
+    for at_s, what, fault in sorted(moments, key=lambda m: m[0]):
+        if at_s >= flight.seconds:
+            break
+        later = at_s > max(f.at_s for f in faults)
+        ls.run_until(began_s + at_s, (lambda: not _stuck(ls)) if later else None)
+        if later and not _stuck(ls):
+            break  # all faults have come, and the flight is over
+        match what:
+            case "heal":
+                _heal(ls, fault, faults, at_s)
+            case "land":
+                ls.command(b'{"verb":"land"}')
+                landed = True
+            case _:
+                _inject(ls, fault, random, ear)
+    ls.run_until(began_s + flight.seconds, lambda: not _stuck(ls))
+    return landed
 
 
 def _stuck(ls: Lockstep) -> list[list[Any]]:
@@ -286,6 +431,7 @@ def finish(config: Config, pieces: Sequence[Record], seeds: Sequence[int]) -> Ou
         "fence breaches": [p["beyond_fence_m"] > 0.0 for p in pieces],
         "stuck flights": [bool(p["stuck"]) for p in pieces],
         "flights with an unexplained failsafe": [bool(p["unexplained"]) for p in pieces],
+        "flights in which a message ended a companion": [bool(p["raised"]) for p in pieces],
     }
     blind = [p["minimum_with_the_blind_m"] < COLLISION_M for p in pieces]
     rows: list[Record] = [
@@ -301,6 +447,11 @@ def finish(config: Config, pieces: Sequence[Record], seeds: Sequence[int]) -> Ou
         "or started anew (not judged)",
         "flights": proportion_text(sum(held), n), "count": sum(held),
     })  # fmt: skip
+    landed = [bool(p["operator_landed"]) for p in pieces]
+    rows.append({
+        "what": "an operator landed those whom a forged plan within all rules kept in the air (not judged)",
+        "flights": proportion_text(sum(landed), n), "count": sum(landed),
+    })  # fmt: skip
     rows += [
         {"what": what, "flights": proportion_text(sum(p[key] for p in pieces), n), "count": sum(p[key] for p in pieces)}
         for key, what in (("formed", "formed"), ("flew_the_plan", "flew the plan's legs (the others landed before)"))
@@ -313,7 +464,8 @@ def finish(config: Config, pieces: Sequence[Record], seeds: Sequence[int]) -> Ou
     )  # fmt: skip
     bad = [
         {"seed": seed, "minimum_m": p["minimum_distance_m"], "faults": p["faults"], "stuck": p["stuck"],
-         "unexplained": p["unexplained"], "beyond_fence_m": p["beyond_fence_m"], "minimum_of": p["minimum_of"]}
+         "unexplained": p["unexplained"], "beyond_fence_m": p["beyond_fence_m"], "minimum_of": p["minimum_of"],
+         "raised": p["raised"]}
         for k, (seed, p) in enumerate(zip(seeds, pieces, strict=True))
         if any(came[k] for came in judged.values())
     ]  # fmt: skip
@@ -336,7 +488,15 @@ def finish(config: Config, pieces: Sequence[Record], seeds: Sequence[int]) -> Ou
         f"{len(bad)} of {n} flights broke a rule; "
         f"the least distance of vehicles that knew where they were is {least:.2f} m."
     )
-    outcome.values |= {"rows": rows, "broken": bad, "least_m": least}
+    flights = [{"seed": seed, **p} for seed, p in zip(seeds, pieces, strict=True)]
+    outcome.values |= {"rows": rows, "broken": bad, "least_m": least, "flights": flights}
     if bad:
         outcome.broken = f"{len(bad)} of {n} flights broke a rule, of seeds {', '.join(str(b['seed']) for b in bad)}"
     return outcome
+
+
+if __name__ == "__main__":
+    # One flight alone, with all that its vehicles told: python -m sim.study.campaign SEED
+    for number in sys.argv[1:]:
+        record = fly(flight_of(load_config("campaign")), int(number), tell=print)
+        sys.stdout.write(f"{json.dumps(record, indent=1)}\n")

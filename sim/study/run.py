@@ -7,6 +7,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from companion.errors import CompanionError, ConfigError
 from sim.study.common import (
+    FLOWN_STUDIES,
     STUDIES,
     Config,
     Outcome,
@@ -47,7 +48,8 @@ def study(
     chosen = parse_seeds((JUDGED_SEEDS if name == "all" else DEFAULT_SEEDS) if seeds is None else seeds)
     configs = [load_config(each, setup) for each in names]
     folder = writable_folder(out)
-    kernels()
+    if not set(names) <= set(FLOWN_STUDIES):
+        kernels()
     console = console or Console()
     done: list[tuple[Config, Outcome]] = []
     bar = Progress(

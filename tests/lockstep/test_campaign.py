@@ -2,6 +2,7 @@
 
 import json
 import os
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -9,9 +10,10 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from companion.errors import CompanionError
+from companion.errors import CompanionError, ConfigError
 from sim.study import campaign
-from sim.study.campaign import Drawn, drawn_faults, flight_of
+from sim.study.attacks import PLANS
+from sim.study.campaign import Drawn, drawn_faults, flight_of, fly
 from sim.study.common import load_config
 from sim.study.run import study
 
@@ -37,7 +39,7 @@ def test_twenty_flights_with_random_faults_break_no_rule(tmp_path: Path) -> None
     _fly(tmp_path, "0..19", four, jobs=len(os.sched_getaffinity(0)))
     found = _found(tmp_path)
     assert found["broken"] == []
-    assert [row["count"] for row in found["rows"][:4]] == [0, 0, 0, 0]
+    assert [row["count"] for row in found["rows"][:5]] == [0, 0, 0, 0, 0]
 
 
 def test_a_broken_rule_ends_the_command_with_a_sentence_after_its_report_is_written(tmp_path: Path) -> None:
@@ -62,5 +64,46 @@ def test_a_seed_draws_the_same_one_to_three_faults_each_time_within_their_window
         assert all(flight.faults_from_s <= f.at_s <= flight.faults_to_s for f in faults)
         assert all(0 <= f.vehicle_id <= flight.vehicles for f in faults)
     kinds = {f.kind for seed in range(200) for f in drawn_faults(flight, seed)}
-    assert len(kinds) == 15
+    assert len(kinds) == 20
     assert isinstance(drawn_faults(flight, 0)[0], Drawn)
+
+
+def test_a_kind_that_is_left_out_changes_only_the_faults_that_were_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    flight = flight_of(load_config("campaign"))
+    with_all = [drawn_faults(flight, seed) for seed in range(200)]
+    fewer = {kind: own for kind, own in reversed(campaign.EXPLAINED.items()) if kind != "forged_plan"}
+    monkeypatch.setattr(campaign, "EXPLAINED", fewer)
+    for seed, faults in enumerate(with_all):
+        kept = [f for f in faults if f.kind != "forged_plan"]
+        assert all(f in drawn_faults(flight, seed) for f in kept)
+
+
+def test_a_message_that_ends_a_companion_breaks_a_rule_and_says_where() -> None:
+    """Whatever raises in a flight, here the forger itself, is taken for an agent that does: judged until then."""
+    flight = replace(flight_of(load_config("campaign")), vehicles=2, seconds=60.0)
+    seed = next(s for s in range(1000) if [f.kind for f in drawn_faults(flight, s)] == ["forged_plan"])
+    told: list[str] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(PLANS, str(drawn_faults(flight, seed)[0].magnitude), lambda plain, _: plain.no_such_field)
+        record = fly(flight, seed, told.append)
+    assert record["raised"].startswith("AttributeError: 'Motion' object has no attribute 'no_such_field'")
+    assert any("climbing" in line for line in told)
+    outcome = campaign.finish(load_config("campaign"), [record], [seed])
+    assert outcome.broken == f"1 of 1 flights broke a rule, of seeds {seed}"
+    assert outcome.values["flights"][0]["seed"] == seed
+
+
+def test_an_endless_plan_of_a_stranger_keeps_nobody_in_the_air_for_ever() -> None:
+    flight = replace(flight_of(load_config("campaign")), vehicles=2, kinds=("forged_plan",), operator_s=45.0)
+    seed = next(s for s in range(1000) if [f.magnitude for f in drawn_faults(flight, s)] == ["endless"])
+    record = fly(flight, seed)
+    assert record["raised"] == ""
+    assert record["stuck"] == []
+    assert record["operator_landed"] == (record["ended_after_s"] > 45.0)
+
+
+def test_a_set_up_may_name_the_kinds_it_wants_and_none_that_there_is_not(tmp_path: Path) -> None:
+    flight = replace(flight_of(load_config("campaign")), kinds=("killed", "mute"))
+    assert {f.kind for seed in range(50) for f in drawn_faults(flight, seed)} == {"killed", "mute"}
+    with pytest.raises(ConfigError, match=r"kinds: there is no eclipse; known are gps_lost, .*forged_digest"):
+        _fly(tmp_path, "0", {"kinds = []": 'kinds = ["eclipse"]'})
