@@ -29,6 +29,7 @@ SLACK = 1e-9
 """share of |g| a by which rows that cannot be met are lowered beyond their least miss: rounding must not close what is
 left of the set"""
 FLAT = 1e-12
+"""a smaller gradient is none"""
 
 
 class Solution(NamedTuple):
@@ -72,8 +73,10 @@ def best(
     for k in range(count):
         size = hypot(rows[k][0], rows[k][1])
         missing = rows[k][2] - rows[k][0] * north - rows[k][1] * east
-        if met and size >= FLAT and missing > ROUNDING * size * most:
+        if size >= FLAT and missing > ROUNDING * size * most:
             north, east, met = on_edge(u_north, u_east, far, rows, k, most)
+            if not met:
+                break
     return north, east, met
 
 
