@@ -43,6 +43,7 @@ def at(time_ns: int, sent_ns: int) -> Situation:
 def test_a_peer_stays_near_for_a_second_after_it_was_found_so() -> None:
     m = mode()
     assert not m.active(0)
+    assert not m.promised
     m.see([7, 3], 0)
     m.see([3], HOLD_NS // 2)
     assert m.peers(HOLD_NS - 1) == (3, 7)
