@@ -269,7 +269,8 @@ def study(
     name: Annotated[
         str,
         typer.Argument(
-            help="example1, example2, table3, readings, pareto, faults, scale, theory, all; or headon, campaign."
+            help="example1, example2, table3, readings, pareto, faults, scale, theory, all; "
+            "or headon, messages, campaign."
         ),
     ],
     seeds: Annotated[

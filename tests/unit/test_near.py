@@ -11,7 +11,6 @@ from companion.core.frames import Ned
 from companion.core.hold import axis, weights
 from companion.core.monitor import PeerMotion, unheard_error_m
 from companion.core.near import (
-    HOLD_S,
     MISSING_MAX_M,
     PUSH_M_S2,
     NearMode,
@@ -30,7 +29,7 @@ MOTION = PeerMotion(
 )  # fmt: skip
 BOUND_M = 0.84
 TICK_NS = 20_000_000
-HOLD_NS = round(HOLD_S * 1e9)
+HOLD_NS = 1_000_000_000
 
 
 def mode(period_s: float = 0.1) -> NearMode:
@@ -44,6 +43,7 @@ def at(time_ns: int, sent_ns: int) -> Situation:
 def test_a_peer_stays_near_for_a_second_after_it_was_found_so() -> None:
     m = mode()
     assert not m.active(0)
+    assert not m.promised
     m.see([7, 3], 0)
     m.see([3], HOLD_NS // 2)
     assert m.peers(HOLD_NS - 1) == (3, 7)
@@ -89,6 +89,25 @@ def test_in_tight_slots_it_takes_2_m_s2_less_than_the_slots_leave(slot_velocity:
 )
 def test_out_of_steady_slots_2_m_s2_make_near_however_tight(neighbour: Neighbour) -> None:
     assert near_push_m_s2(neighbour, ZERO, CLOSEST_M, RADIUS_M) == PUSH_M_S2
+
+
+@pytest.mark.parametrize(("rate_m_s", "steady"), [(0.0499, True), (-0.0499, True), (0.0501, False), (-0.0501, False)])
+def test_slots_keep_their_distance_up_to_5_cm_s_along_any_axis(rate_m_s: float, steady: bool) -> None:
+    left = resting_push_m_s2(CLOSEST_M, RADIUS_M) - PUSH_M_S2
+    for offset, velocity in (
+        (Ned(CLOSEST_M, 0.0, 0.0), Ned(rate_m_s, 0.0, 0.0)),
+        (Ned(0.0, -CLOSEST_M, 0.0), Ned(0.0, rate_m_s, 0.0)),
+        (Ned(CLOSEST_M, 0.0, 0.5), Ned(0.0, 0.0, rate_m_s * hypot(CLOSEST_M, 0.2) / 0.5)),
+    ):
+        push = near_push_m_s2(in_slots(offset, slot_velocity=velocity), ZERO, CLOSEST_M, RADIUS_M)
+        assert (push < PUSH_M_S2) is steady
+        alike = near_push_m_s2(in_slots(offset, slot_velocity=velocity), velocity, CLOSEST_M, RADIUS_M)
+        assert alike == pytest.approx(left, abs=0.2)
+
+
+def test_height_between_slots_counts_by_the_downwash() -> None:
+    above = near_push_m_s2(in_slots(Ned(0.0, 0.0, 2.5 * 1.8)), ZERO, CLOSEST_M, RADIUS_M)
+    assert above == pytest.approx(near_push_m_s2(in_slots(Ned(0.0, 1.8, 0.0)), ZERO, CLOSEST_M, RADIUS_M))
 
 
 def test_slots_that_cross_never_make_it_less_than_the_closest_configured_would() -> None:
@@ -172,8 +191,8 @@ def test_a_message_that_is_missing_makes_near_in_tight_slots_too() -> None:
 @given(st.floats(0.0, 10.0))
 def test_the_bound_of_a_near_peer_is_the_triggers_until_its_sample_is_old(age_s: float) -> None:
     bound = near_bound_m(age_s, BOUND_M, MOTION)
-    assert BOUND_M <= bound <= BOUND_M + MISSING_MAX_M
-    assert bound == pytest.approx(min(max(BOUND_M, unheard_error_m(age_s, MOTION)), BOUND_M + MISSING_MAX_M))
+    assert BOUND_M <= bound <= BOUND_M + 1.0
+    assert bound == pytest.approx(min(max(BOUND_M, unheard_error_m(age_s, MOTION)), BOUND_M + 1.0))
 
 
 def test_two_periods_without_a_message_are_covered_by_the_triggers_bound() -> None:
