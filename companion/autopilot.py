@@ -1,13 +1,15 @@
 """What we know of our autopilot and what we have asked of it. Sans-I/O; used by the agent alone.
 
 PX4's quirks that shape it: an answer to a command names only the command, so commands of one kind are asked one after
-another; GPS_GLOBAL_ORIGIN comes once after boot and must be requested; LOCAL_POSITION_NED says nothing of its validity.
+another; GPS_GLOBAL_ORIGIN comes once after boot and must be requested; LOCAL_POSITION_NED says nothing of its validity;
+what a command has done shows in the next HEARTBEAT, which comes once a second.
 """
 
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import inf
+from typing import NamedTuple
 
 from companion.core.failsafe import STATUS_S
 from companion.core.frames import Geodetic, LocalFrame, Ned
@@ -26,6 +28,10 @@ from companion.wire.mavlink import MavlinkLink, Px4Mode
 
 RETRY_S = 0.5
 TRIES = 8
+ANSWER_S = 1.0
+"""what is asked once is taken for not answered after this; preflight allows a link no such round trip"""
+EFFECT_S = 0.2
+"""a HEARTBEAT this much later than an answer knows of what was answered: PX4 makes the two in different threads"""
 PARAMETER_TRIES = 6
 PARAMETERS_AT_ONCE = 3
 """requests on the way at a time: a serial line carries the positions too"""
@@ -46,10 +52,26 @@ ACCEPTED, TEMPORARILY_REJECTED, IN_PROGRESS = 0, 1, 5
 class _Request:
     name: str
     make: Callable[[], bytes]
+    once: bool = False
+    """whether it may have been done though its answer is lost, and must not be done twice"""
     tries: int = 0
     next_ns: int = 0
     withdrawn: bool = False
     """asked, and wanted no longer: it waits for its answer only"""
+
+    @property
+    def given_up(self) -> bool:
+        """Whether it is not sent again without an answer."""
+        return self.withdrawn or self.tries >= (1 if self.once else TRIES)
+
+
+class Outcome(NamedTuple):
+    """What came of a request that the autopilot has not refused."""
+
+    since_ns: int
+    """when it was accepted, or taken for not answered (monotonic)"""
+    accepted: bool
+    """False: sent once and not answered, so that nobody knows whether it was done"""
 
 
 @dataclass(slots=True)
@@ -173,6 +195,8 @@ class AutopilotClient:
         self._queues: dict[int, deque[_Request]] = {}
         self._refused: dict[str, int] = {}
         """name of a request -> when it may be asked again after a refusal (monotonic ns)"""
+        self._outcomes: dict[str, Outcome] = {}
+        self._mode_asked: Px4Mode | None = None
         self._now_ns = 0
         self._next_heartbeat_ns = 0
         self._next_origin_ns = 0
@@ -255,7 +279,7 @@ class AutopilotClient:
             self.origin = None
             if self.fleet_origin is not None:
                 self.frame = None
-            self._queues.clear()
+            self.cancel()
             self.parameters.restart()
             self._round_trips_ns.clear()
             self._clock_ahead_ns.clear()
@@ -306,44 +330,71 @@ class AutopilotClient:
         if request.withdrawn:
             queue.popleft()
             return
-        if event.result in (TEMPORARILY_REJECTED, IN_PROGRESS) and request.tries < TRIES:
-            request.next_ns = now.monotonic_ns + round(RETRY_S * 1e9)
+        if request.once and event.result == TEMPORARILY_REJECTED:
+            # It was certainly not done, and may be asked anew.
+            queue.popleft()
+            self._refused[request.name] = now.monotonic_ns + round(RETRY_S * 1e9)
+            return
+        if event.result in (TEMPORARILY_REJECTED, IN_PROGRESS) and (request.once or request.tries < TRIES):
+            request.next_ns = now.monotonic_ns + round((ANSWER_S if request.once else RETRY_S) * 1e9)
             return
         queue.popleft()
-        if event.result != ACCEPTED:
+        if event.result == ACCEPTED:
+            self._outcomes[request.name] = Outcome(now.monotonic_ns, accepted=True)
+        else:
             self._refused[request.name] = now.monotonic_ns + round(RETRY_S * 1e9)
             self.counts[f"refused: {request.name.split()[0]}"] += 1
             if not request.name.startswith("stream"):
                 self.notes.append(f"autopilot refused {request.name} (result {event.result})")
 
-    def ask(self, name: str, command: int, *parameters: float) -> None:
-        """Ask for a command, retried until answered; the same name is not queued twice, nor right after a refusal."""
-        if self._now_ns < self._refused.get(name, 0):
+    def ask(self, name: str, command: int, *parameters: float, once: bool = False) -> None:
+        """Ask for a command, retried until answered.
+
+        The same name is not queued twice, nor right after a refusal, nor, once accepted, before a heartbeat could have
+        shown what came of it. `once`: it is sent a single time, unless the answer says that it was not done.
+        """
+        if self._now_ns < self._refused.get(name, 0) or self._effect_is_open(name):
             return
         queue = self._queues.setdefault(command, deque())
         if all(r.name != name for r in queue):
-            queue.append(_Request(name, lambda: self.link.command(command, *parameters)))
+            queue.append(_Request(name, lambda: self.link.command(command, *parameters), once))
+
+    def outcome(self, name: str) -> Outcome | None:
+        """What came of a request, once a heartbeat has come that knows of it; None before, and where it was refused."""
+        return None if self._effect_is_open(name) else self._outcomes.get(name)
+
+    def _effect_is_open(self, name: str) -> bool:
+        """Whether a request was accepted, or may have been, and no heartbeat that knows of it has come yet."""
+        outcome = self._outcomes.get(name)
+        if outcome is None or self.heartbeat_ns is None:
+            return outcome is not None
+        return self.heartbeat_ns < outcome.since_ns + (round(EFFECT_S * 1e9) if outcome.accepted else 0)
 
     def set_mode(self, mode: Px4Mode) -> None:
-        """Ask for a flight mode; one asked for before and not answered is dropped."""
+        """Ask for a flight mode; one asked for before is forgotten."""
         command, *parameters = wire.mode_parameters(mode)
-        queue = self._queues.get(command)
-        if queue and queue[0].name != mode.name:
-            queue.clear()
+        if self._mode_asked is not None and self._mode_asked is not mode:
+            self._queues[command].clear()
+            self._outcomes.pop(self._mode_asked.name, None)
+        self._mode_asked = mode
         self.ask(mode.name, command, *parameters)
 
     def withdraw(self, *names: str) -> None:
         """Ask no more for what is wanted no longer, or was seen to be done though its answer was lost."""
+        for name in names:
+            self._outcomes.pop(name, None)
         for queue in self._queues.values():
             for request in [r for r in queue if r.name in names]:
                 if request.tries == 0:
                     queue.remove(request)
                 else:
-                    request.tries, request.withdrawn = TRIES, True
+                    request.withdrawn = True
 
     def cancel(self) -> None:
         """Ask for nothing more: the vehicle is somebody else's now."""
         self._queues.clear()
+        self._outcomes.clear()
+        self._mode_asked = None
 
     def due(self, now: Instant) -> list[bytes]:
         """Datagrams to send now: heartbeat at 1 Hz, requests with their retries."""
@@ -358,14 +409,16 @@ class AutopilotClient:
             self._next_origin_ns = now.monotonic_ns + 1_000_000_000
             out.append(self.link.command(*wire.request_message_parameters(wire.ORIGIN_MESSAGE_ID)))
         for queue in self._queues.values():
-            while queue and queue[0].tries >= TRIES and now.monotonic_ns >= queue[0].next_ns:
+            while queue and queue[0].given_up and now.monotonic_ns >= queue[0].next_ns:
                 request = queue.popleft()
                 if not request.withdrawn:
+                    if request.once:
+                        self._outcomes[request.name] = Outcome(now.monotonic_ns, accepted=False)
                     self.counts["unanswered"] += 1
                     self.notes.append(f"autopilot never answered {request.name}")
             if queue and now.monotonic_ns >= queue[0].next_ns:
                 queue[0].tries += 1
-                queue[0].next_ns = now.monotonic_ns + round(RETRY_S * 1e9)
+                queue[0].next_ns = now.monotonic_ns + round((ANSWER_S if queue[0].once else RETRY_S) * 1e9)
                 out.append(queue[0].make())
         if not self.armed:
             out += self._preflight_due(now.monotonic_ns)

@@ -63,8 +63,9 @@ ENGAGED_AWAY_M = 3.0
 """whoever engages so far from its slot comes to it by a way of its own"""
 RESUME_LIMIT_NS = 5_000_000_000
 RELEASE_LIMIT_NS = 4_000_000_000
-LATE_OFFBOARD_NS = 1_000_000_000
-"""OFFBOARD that was asked for and is wanted no longer may come so late"""
+LATE_MODE_NS = 1_000_000_000
+"""a mode that was asked for and is wanted no longer may come so late"""
+LATE_MODES = frozenset({Px4Mode.OFFBOARD, Px4Mode.AUTO_TAKEOFF})
 KILL_LIMIT_NS = 10_000_000_000
 ON_GROUND = 1
 BEING_KILLED = "it is being killed"
@@ -170,6 +171,8 @@ class Flight:
         """Arm and climb."""
         if self._orders.kill_ns is not None:
             return BEING_KILLED
+        self._orders.release_ns = None
+        self.autopilot.withdraw(Px4Mode.AUTO_LOITER.name)
         self._happened(PhaseEvent.TAKE_OFF, now)
         return None
 
@@ -340,11 +343,11 @@ class Flight:
                 ap.ask("kill", *wire.kill_parameters())
         if orders.release_ns is not None:
             left = ap.custom_mode not in orders.modes_to_leave
-            if now.monotonic_ns - orders.release_ns > (LATE_OFFBOARD_NS if left else RELEASE_LIMIT_NS):
+            if now.monotonic_ns - orders.release_ns > (LATE_MODE_NS if left else RELEASE_LIMIT_NS):
                 orders.release_ns = None
                 ap.withdraw(Px4Mode.AUTO_LOITER.name)
             elif left:
-                orders.modes_to_leave &= {Px4Mode.OFFBOARD}
+                orders.modes_to_leave &= LATE_MODES
                 ap.withdraw(Px4Mode.AUTO_LOITER.name)
             else:
                 ap.set_mode(Px4Mode.AUTO_LOITER)
@@ -370,13 +373,23 @@ class Flight:
         elif ap.custom_mode == Px4Mode.OFFBOARD:
             # Left over from a flight before; without setpoints PX4 does not arm in it.
             ap.set_mode(Px4Mode.AUTO_LOITER)
+        elif (outcome := ap.outcome("arming")) is not None:
+            # Whoever disarms has the last word; an arming that was not answered may have been done, and undone by him.
+            what = "disarmed again after it was armed" if outcome.accepted else "the arming was not answered"
+            self._fail(Failsafe.NOT_ARMED, now, f"{what}; the take-off is given up")
+            self._happened(PhaseEvent.GIVEN_UP, now)
         else:
-            ap.ask("arming", *wire.arm_parameters(True))
+            ap.ask("arming", *wire.arm_parameters(True), once=True)
+
+    def _disarmed_early(self, now: Instant) -> None:
+        """A take-off that its pilot has ended by disarming; take-off mode would take off whoever arms next."""
+        self._happened(PhaseEvent.DISARMED, now)
+        self._hold_mode_after({Px4Mode.AUTO_TAKEOFF}, now)
 
     def _watch_take_off(self, now: Instant) -> None:
         ap = self.autopilot
         if not ap.armed:
-            self._happened(PhaseEvent.DISARMED, now)
+            self._disarmed_early(now)
         elif ap.custom_mode == Px4Mode.AUTO_TAKEOFF:
             self._happened(PhaseEvent.TAKING_OFF, now)
         elif ap.custom_mode not in OUR_MODES and ap.custom_mode != self._mode_before:
@@ -392,7 +405,7 @@ class Flight:
     def _watch_climb(self, now: Instant, positioned: bool) -> None:
         ap = self.autopilot
         if not ap.armed:
-            self._happened(PhaseEvent.DISARMED, now)
+            self._disarmed_early(now)
             return
         if ap.custom_mode == Px4Mode.OFFBOARD:
             self._happened(PhaseEvent.ENGAGED, now)

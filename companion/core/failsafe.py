@@ -131,7 +131,10 @@ FAILSAFES: dict[Failsafe, Row] = {
     Failsafe.AUTOPILOT: Row(
         "the next CURRENT_MODE (20 Hz) or HEARTBEAT", MODE_S, Action.HAND_OVER, "the same", _BY_COMMAND,
     ),
-    Failsafe.NOT_ARMED: Row("10 s", TAKE_OFF_S, Action.CONTINUE, "the take-off is given up, on the ground", "take-off"),
+    Failsafe.NOT_ARMED: Row(
+        "10 s; at once where a heartbeat after the arming says disarmed: the pilot's word", TAKE_OFF_S, Action.CONTINUE,
+        "the take-off is given up, on the ground", "take-off",
+    ),
     Failsafe.NO_TAKE_OFF: Row("10 s armed", TAKE_OFF_S, Action.LAND, "", _NOT),
     Failsafe.ALTITUDE: Row("60 s of climb", CLIMB_S, Action.LAND, "", _NOT),
     Failsafe.MISSING: Row(
