@@ -51,7 +51,7 @@ from companion.core.values import (
 )
 from companion.errors import ConfigError, WireError
 from companion.flight import Flight
-from companion.orders import REVISION_JUMP_MAX, Order, OrderBook, read_order
+from companion.orders import Order, OrderBook, read_order, revision_fault
 from companion.preflight import Account, Check, assignment_hash, own_checks, unmet
 from companion.wire.mavlink import MavlinkLink, mode_name
 from companion.wire.peer import decode_motion, decode_state, encode_motion, encode_state
@@ -129,7 +129,7 @@ class Agent:
         self.peers = PeerTable(vehicle_id, others, config.peer_limits, self.programme)
         self.safety = SafetyFilter(config.safety_limits)
         self.flight = Flight(config, vehicle_id, self.autopilot, self.programme, self.peers, self.safety)
-        self.orders = OrderBook()
+        self.orders = OrderBook(boot_id)
         self.messages_sent = 0
         self.setpoints_sent = 0
         self._gains = config.gains
@@ -142,6 +142,8 @@ class Agent:
         self._filter = (SendFilter(), SendFilter(), SendFilter())
         self._position_came = False
         self._last_tick: Instant | None = None
+        self._began_ns: int | None = None
+        """when this agent first acted (monotonic)"""
         self._observed_ns: int | None = None
         """when the own state was last known"""
         self._tick: Tick | None = None
@@ -225,18 +227,18 @@ class Agent:
         again = self.orders.answer_again(payload)
         if again is not None:
             return again
-        order = read_order(payload)
+        order = read_order(payload, self.id)
         if isinstance(order, tuple):
             kind, sentence = order
             self.rejected[f"command: {kind}"] += 1
             return self._reply(sentence)
-        refusal = self.orders.refusal(order)
+        refusal = self.orders.refusal(order, self.flight.begun)
         if refusal is not None:
             self.rejected["command: not in order"] += 1
-            return self._reply(refusal)
+            return self._reply(refusal, in_order=False)
         refusal = self._obey(order, now)
         if refusal is None:
-            self.orders.obeyed(order)
+            self.orders.obeyed_now(order)
         answer = self._reply(refusal)
         self.orders.answered(payload, answer)
         return answer
@@ -262,14 +264,15 @@ class Agent:
             return str(error)
         return self._consider(motion, now)
 
-    def _reply(self, refusal: str | None) -> bytes:
+    def _reply(self, refusal: str | None, in_order: bool = True) -> bytes:
         answer = {
             "vehicle": self.id,
             "accepted": refusal is None,
             "reason": refusal,
             "phase": self.phase.name.lower(),
+            "in_order": in_order,
             "revision": self.programme.newest.revision,
-            "command": [self.orders.revision, self.orders.issuer],
+            "place": self.orders.place(self.flight.begun),
         }
         return json.dumps(answer).encode()
 
@@ -364,8 +367,10 @@ class Agent:
         return None
 
     def _unsound(self, motion: Motion, now: Instant) -> str | None:
-        if motion.revision > self.programme.newest.revision + REVISION_JUMP_MAX:
-            return f"its revision {motion.revision} is more than {REVISION_JUMP_MAX} ahead"
+        told = [s.revision for i in self.peers.ids if (s := self.peers.sample(i)) is not None]
+        fault = revision_fault(motion.revision, self.programme.newest.revision, told)
+        if fault is not None:
+            return fault
         if set(motion.slots) != set(self.programme.newest.slots):
             return "its vehicles are not this fleet's"
         if abs(motion.start_ns - now.fleet_ns) > 3_600_000_000_000:
@@ -516,6 +521,8 @@ class Agent:
 
     def advance(self, now: Instant) -> Outputs:
         """Do what is due; the returned outputs are to be sent in their order."""
+        if self._began_ns is None:
+            self._began_ns = now.monotonic_ns
         since = None if self._last_tick is None else now.monotonic_ns - self._last_tick.monotonic_ns
         if self._position_came or since is None or since >= self._timer_ns:
             self._control(now, since)
@@ -720,7 +727,9 @@ class Agent:
             "ready": [c.says for c in unready],
             "unfit": [c.says for c in unready if c.lasting],
             "revision": self.programme.newest.revision,
-            "command": [self.orders.revision, self.orders.issuer],
+            "fleet": self.config.fleet.name,
+            "up_s": 0.0 if self._began_ns is None else (now.monotonic_ns - self._began_ns) * 1e-9,
+            "place": self.orders.place(self.flight.begun),
             "shape": self.programme.newest.shape,
             "moving": self.programme.newest.end_ns is None or bool(self.programme.newest.legs),
             "position_error_m": tick.position_error_m if tick else None,

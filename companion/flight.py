@@ -110,6 +110,8 @@ class Flight:
     """a peer holds a newer motion than we do"""
     formation_since_ns: int | None = None
     phase_since_ns: int = 0
+    begun: int = 0
+    """flights so far: take-offs commanded and resumptions"""
     positions: PositionWatch = field(init=False)
     _orders: _Orders = field(default_factory=_Orders)
     _mode_before: int | None = None
@@ -250,6 +252,7 @@ class Flight:
         self.notes.append(f"{before.name.lower()} -> {after.name.lower()}: {event.value}")
         self.phase = after
         self.phase_since_ns = now.monotonic_ns
+        self.begun += event in (PhaseEvent.TAKE_OFF, PhaseEvent.RESUMED)
         if after is Phase.ARMED:
             self._mode_before = ap.custom_mode
         elif before is not Phase.ARMED:

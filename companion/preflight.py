@@ -33,17 +33,20 @@ ROUNDING = 1e-6
 """relative: PX4's parameters are float32"""
 
 
+_Text = Annotated[str, Field(max_length=4000)]
+
+
 @dataclass(frozen=True, slots=True)
 class Check:
     """One row: what was looked at, what it was, what it may be."""
 
-    name: str
-    value: float | int | str | None
+    name: _Text
+    value: float | Annotated[int, Field(ge=-(1 << 63), lt=1 << 63)] | _Text | None
     """None: not known"""
-    limit: str
+    limit: _Text
     """what is allowed, with its unit"""
     met: bool
-    says: str
+    says: _Text
     """the fault as a sentence; of no meaning when met"""
     lasting: bool = False
     """whether it cannot come right by waiting"""
@@ -363,7 +366,12 @@ def assignment_hash(config: FleetConfig) -> str:
     return blake2s(text.replace("-0.000", "0.000").encode(), digest_size=8).hexdigest()
 
 
-_Coordinate = Annotated[float, Field(allow_inf_nan=False)]
+# Bounds that every true answer keeps by far, and within which what is computed from it cannot overflow.
+_Coordinate = Annotated[float, Field(ge=-1e8, le=1e8, allow_inf_nan=False)]
+_Id = Annotated[int, Field(ge=0, le=255)]
+_Word = Annotated[str, Field(max_length=64)]
+_Unsigned32 = Annotated[int, Field(ge=0, lt=1 << 32)]
+_TimeNs = Annotated[int, Field(ge=0, lt=1 << 63)]
 _Place = tuple[_Coordinate, _Coordinate, _Coordinate]
 
 
@@ -372,14 +380,14 @@ class Account(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
-    vehicle: int
-    boot_id: int
-    system_id: int
-    configuration: str
-    assignment: str
+    vehicle: _Id
+    boot_id: _Unsigned32
+    system_id: _Id
+    configuration: _Word
+    assignment: _Word
     flying: bool
     """whether it flies on its companion's command"""
-    revision: int
+    revision: _Unsigned32
     """of its newest motion"""
     position_ned_m: _Place | None
     """fleet frame"""
@@ -398,9 +406,9 @@ class ClockReading(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
-    boot_id: int
-    received_ns: int
-    answered_ns: int
+    boot_id: _Unsigned32
+    received_ns: _TimeNs
+    answered_ns: _TimeNs
 
 
 def as_json(check: Check) -> dict[str, Any]:
