@@ -38,6 +38,8 @@ class _Status(BaseModel):
     battery_percent: Annotated[int, Field(ge=-1, le=100)]
     failsafes: list[_Text]
     rejected: dict[_Text, _Count]
+    own_id_heard: bool = False
+    """whether its companion hears another one under its own id"""
 
 
 def read_status(answer: bytes, vehicle_id: int) -> dict[str, Any] | str:

@@ -82,7 +82,7 @@ def until_mode(ls: Lockstep, wanted: Px4Mode) -> None:
 # -- order -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_command_that_comes_late_is_refused_with_the_reason_and_a_retry_is_answered_alike() -> None:
+def test_an_older_command_is_refused_with_the_reason_and_a_retry_is_answered_alike() -> None:
     ls, _ = aloft(1)
     before = place(ls)
     release = order("release", "a", before)
