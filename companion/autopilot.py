@@ -8,10 +8,10 @@ what a command has done shows in the next HEARTBEAT, which comes once a second.
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from math import inf
+from math import dist, inf
 from typing import NamedTuple
 
-from companion.core.failsafe import STATUS_S
+from companion.core.failsafe import DAMAGE_M, STATUS_S
 from companion.core.frames import Geodetic, LocalFrame, Ned
 from companion.core.values import ZERO, Instant
 from companion.preflight import (
@@ -22,6 +22,7 @@ from companion.preflight import (
     PARAMETERS,
     POSITION_LIMIT_S,
     AutopilotFacts,
+    same_setting,
 )
 from companion.wire import mavlink as wire
 from companion.wire.mavlink import MavlinkLink, Px4Mode
@@ -45,6 +46,9 @@ RATE_WINDOW_NS = 2_000_000_000
 LATENCY_WINDOW_NS = 1_000_000_000
 """short, since a simulated autopilot's clock may run several per cent slow: what it falls behind within the window
 counts as delay"""
+BOOT_MS_ROUND = 1 << 32
+BOOT_MS_SLACK = 2_000
+"""clocks and links differ by less than this between two positions (ms); no autopilot boots faster and speaks"""
 ACCEPTED, TEMPORARILY_REJECTED, IN_PROGRESS = 0, 1, 5
 
 
@@ -104,7 +108,10 @@ class BootClock:
 
 @dataclass(slots=True)
 class ParameterReader:
-    """Reads the parameters that preflight looks at, in rounds; one that never comes is missing until it does."""
+    """Reads the parameters that preflight looks at, in rounds; one that never comes is missing until it does.
+
+    Of the names of one setting the one that has answered is read on, and the others are not asked for.
+    """
 
     values: dict[str, float | int] = field(default_factory=dict)
     missing: set[str] = field(default_factory=set)
@@ -123,13 +130,16 @@ class ParameterReader:
         """A value that came, asked for or not."""
         if name in PARAMETERS:
             self.values[name] = value
-            self.missing.discard(name)
-            self._open.pop(name, None)
+            for other in same_setting(name):
+                self.missing.discard(other)
+                self._open.pop(other, None)
 
     def due(self, now_ns: int) -> list[str]:
         """Names to ask for now."""
         if not self._open and now_ns >= self._round_ns:
-            self._open = dict.fromkeys(PARAMETERS, (0, 0))
+            known = self.values.keys()
+            wanted = [n for n in PARAMETERS if n in known or known.isdisjoint(same_setting(n))]
+            self._open = dict.fromkeys(wanted, (0, 0))
         asked = []
         for name, (tries, next_ns) in list(self._open.items())[:PARAMETERS_AT_ONCE]:
             if now_ns < next_ns:
@@ -184,6 +194,8 @@ class AutopilotClient:
         self.foreign_ns: int | None = None
         """when an autopilot of another system id last spoke (monotonic ns)"""
         self.origin: Geodetic | None = None
+        self.origin_crept_ned_m = ZERO
+        """how far the origin has moved so far in steps too small for a jump of the position"""
         self.frame: LocalFrame | None = None if fleet_origin is not None else LocalFrame(ZERO)
         self.boot = BootClock()
         self.heartbeat_ns: int | None = None
@@ -271,11 +283,26 @@ class AutopilotClient:
         for message_id in wire.STREAMS_OFF:
             self.ask(f"stream {message_id}", *wire.interval_parameters(message_id, 0.0))
 
+    def _unwrapped(self, boot_ms: int, now: Instant) -> int:
+        """Time since boot whose 32 bit go round every 49.7 days, gone on with.
+
+        A small number after a large one is a reboot, unless it is as much later as time has passed here.
+        """
+        last = self.boot.last_boot_ms
+        if last < 0:
+            return boot_ms
+        on = last - last % BOOT_MS_ROUND + boot_ms
+        passed_ms = (now.monotonic_ns - self._arrivals_ns[-1]) // 1_000_000 if self._arrivals_ns else 0
+        later_ms = on + BOOT_MS_ROUND - last
+        return on + BOOT_MS_ROUND if on < last - 1000 and later_ms <= passed_ms + BOOT_MS_SLACK else on
+
     def _position(self, event: wire.LocalPosition, now: Instant) -> bool:
-        if event.boot_ms < self.boot.last_boot_ms - 1000:
+        boot_ms = self._unwrapped(event.boot_ms, now)
+        if boot_ms < self.boot.last_boot_ms - 1000:
             self.notes.append("autopilot rebooted")
             self.counts["autopilot reboot"] += 1
             self.boot.restart()
+            boot_ms = event.boot_ms
             self.origin = None
             if self.fleet_origin is not None:
                 self.frame = None
@@ -285,10 +312,10 @@ class AutopilotClient:
             self._clock_ahead_ns.clear()
             self.home_altitude_amsl_m = None
             self._set_up()
-        elif event.boot_ms <= self.boot.last_boot_ms:
+        elif boot_ms <= self.boot.last_boot_ms:
             self.counts["position repeated"] += 1
             return False
-        made_ns = self.boot.arrived(event.boot_ms, now.monotonic_ns)
+        made_ns = self.boot.arrived(boot_ms, now.monotonic_ns)
         self._arrivals_ns.append(now.monotonic_ns)
         if self.frame is None:
             return False
@@ -305,11 +332,14 @@ class AutopilotClient:
         self._origin_doubted = False
         if self.fleet_origin is None or origin == self.origin:
             return
-        if self.origin is not None:
+        before, self.frame = self.frame, LocalFrame.from_origins(origin, self.fleet_origin)
+        if self.origin is not None and before is not None:
             self.notes.append("estimator origin moved")
             self.counts["estimator origin moved"] += 1
+            was, is_, crept = before.to_fleet(ZERO), self.frame.to_fleet(ZERO), self.origin_crept_ned_m
+            if dist(was, is_) < DAMAGE_M:
+                self.origin_crept_ned_m = Ned(*(c + b - a for a, b, c in zip(was, is_, crept, strict=True)))
         self.origin = origin
-        self.frame = LocalFrame.from_origins(origin, self.fleet_origin)
 
     def _time_answer(self, event: wire.TimeAnswer, now: Instant) -> None:
         if event.asked_ns not in self._round_trips_open_ns:

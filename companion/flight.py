@@ -13,6 +13,7 @@ from companion.config import FleetConfig
 from companion.core.failsafe import (
     BATTERY_S,
     CLIMB_S,
+    CREEP_LIMIT_M,
     FAILSAFES,
     FROZEN_S,
     HEARTBEAT_S,
@@ -24,6 +25,7 @@ from companion.core.failsafe import (
     Action,
     Failsafe,
 )
+from companion.core.frames import Ned
 from companion.core.health import Persistence, PositionWatch
 from companion.core.neighbours import PeerTable
 from companion.core.phase import PhaseEvent, next_phase
@@ -67,7 +69,7 @@ LATE_MODE_NS = 1_000_000_000
 """a mode that was asked for and is wanted no longer may come so late"""
 LATE_MODES = frozenset({Px4Mode.OFFBOARD, Px4Mode.AUTO_TAKEOFF})
 KILL_LIMIT_NS = 10_000_000_000
-ON_GROUND = 1
+LANDED_STATE_UNKNOWN, ON_GROUND = 0, 1
 BEING_KILLED = "it is being killed"
 
 
@@ -129,6 +131,8 @@ class Flight:
     _alone_since_ns: int | None = None
     _jumps: int = 0
     _first_jump_ns: int | None = None
+    _origin_crept_ned_m: Ned = ZERO
+    """of the autopilot, when it was last engaged"""
     _last_jump_ns: int = 0
     _engages: bool = False
     _slot: tuple[int, Reference] | None = None
@@ -220,6 +224,8 @@ class Flight:
             return f"it is {self.phase.name.lower()}: to resume is for the released, and for those found in the air"
         if not self._in_the_air:
             return "it is on the ground"
+        if self.autopilot.landed_state == LANDED_STATE_UNKNOWN:
+            return "its autopilot does not tell whether it is in the air"
         if self.autopilot.state(now) is None or self.positions.frozen:
             return "no position"
         self._orders.release_ns = None
@@ -266,6 +272,7 @@ class Flight:
             self.formation_since_ns = now.fleet_ns
             self._engages = event is PhaseEvent.ENGAGED
             self._alone_since_ns = self._first_jump_ns = None
+            self._origin_crept_ned_m = ap.origin_crept_ned_m
         if after is Phase.LANDING:
             self._land_seen = False
         if after is Phase.RELEASED:
@@ -492,6 +499,10 @@ class Flight:
         uncertain = not (flags & ap.flags_needed == ap.flags_needed and accuracy_m <= ACCURACY_LIMIT_M)
         if self._uncertain.holds(uncertain, now.monotonic_ns):
             self._fail(Failsafe.COVARIANCE, now, f"{accuracy_m:.1f} m, flags {flags:#x}")
+            return False
+        crept_m = dist(ap.origin_crept_ned_m, self._origin_crept_ned_m)
+        if crept_m > CREEP_LIMIT_M:
+            self._fail(Failsafe.COVARIANCE, now, f"estimator's origin has crept {crept_m:.1f} m")
             return False
         if self.positions.jumps != self._jumps:
             self._jump(now)

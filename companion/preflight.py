@@ -257,9 +257,16 @@ class Rule(NamedTuple):
 
 PARAMETERS = (
     "COM_OF_LOSS_T", "COM_OBL_RC_ACT", "COM_RC_OVERRIDE", "NAV_RCL_ACT", "COM_RCL_EXCEPT", "NAV_DLL_ACT", "GF_ACTION",
-    "COM_LOW_BAT_ACT", "COM_DISARM_LAND", "MPC_XY_VEL_MAX", "MPC_Z_VEL_MAX_UP", "MPC_Z_VEL_MAX_DN",
+    "COM_LOW_BAT_ACT", "COM_DISARM_LAND", "MPC_XY_VEL_MAX", "MPC_Z_VEL_MAX_UP", "MPC_Z_VEL_MAX_DN", "MAN_OVERRIDE_SPD",
 )  # fmt: skip
 """PX4 parameters that preflight reads"""
+ALTERNATIVES = (("COM_RC_OVERRIDE", "MAN_OVERRIDE_SPD"),)
+"""names under which PX4's versions have one setting (the second since v1.18): whichever answers counts"""
+
+
+def same_setting(name: str) -> tuple[str, ...]:
+    """All names of a parameter's setting, its own included."""
+    return next((names for names in ALTERNATIVES if name in names), (name,))
 
 
 def _one_of(*allowed: int) -> tuple[str, Callable[[float], bool]]:
@@ -299,6 +306,7 @@ def parameter_rules(config: FleetConfig, on_loss: float | None = None) -> dict[s
             "the others of a way back",
         ),
         "COM_RC_OVERRIDE": Rule("has bit 1", lambda v: bool(int(v) & 2), "a pilot's sticks would not end OFFBOARD"),
+        "MAN_OVERRIDE_SPD": Rule(">= 0", lambda v: v >= 0.0, "a pilot's sticks would not end OFFBOARD"),
         "NAV_RCL_ACT": Rule(
             *(_one_of(1, 2, 3) if pilot else _one_of(0, 1, 2, 3)), "lost RC must not end in a fall, nor in nothing"
         ),
@@ -317,7 +325,7 @@ def parameter_rules(config: FleetConfig, on_loss: float | None = None) -> dict[s
 
 
 def _parameter_checks(facts: AutopilotFacts, config: FleetConfig) -> Iterator[Check]:
-    waiting = []
+    waiting = set()
     for name, rule in parameter_rules(config, facts.parameters.get("COM_OBL_RC_ACT")).items():
         value = facts.parameters.get(name)
         if value is not None:
@@ -326,13 +334,18 @@ def _parameter_checks(facts: AutopilotFacts, config: FleetConfig) -> Iterator[Ch
             if rule.limit.startswith("has "):
                 says = f"{name} is {value:g}, must have {rule.limit[4:]}: {rule.why}"
             yield Check(name, tidy(value), rule.limit, met, says, lasting=True)
-        elif name in facts.missing:
-            yield Check(name, None, rule.limit, False, f"{name} cannot be read")
-        else:
-            waiting.append(name)
+            continue
+        names = same_setting(name)
+        if not facts.parameters.keys().isdisjoint(names):
+            continue  # another version's name of it has answered
+        if not facts.missing.issuperset(names):
+            waiting.add(names)
+        elif name == names[0]:
+            yield Check(name, None, rule.limit, False, f"{' or '.join(names)} cannot be read")
     if waiting:
-        says = f"{len(waiting)} of {len(PARAMETERS)} parameters not read yet"
-        yield Check("parameters", len(PARAMETERS) - len(waiting), f"= {len(PARAMETERS)} read", False, says)
+        wanted = len({same_setting(name) for name in PARAMETERS})
+        says = f"{len(waiting)} of {wanted} parameters not read yet"
+        yield Check("parameters", wanted - len(waiting), f"= {wanted} read", False, says)
 
 
 def _level(p: Ned) -> float:

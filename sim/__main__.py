@@ -251,6 +251,7 @@ def sitl(
     truth: Annotated[Path, typer.Option()],
     fleet: FleetFile = DEFAULT_FILE,
     parameter: Parameters = None,
+    ready: Annotated[Path | None, typer.Option(help="A file to make once every parameter is read back.")] = None,
 ) -> None:
     """Run PX4 SITL instances until standard input closes: for launchers."""
     from companion.config import parse
@@ -258,7 +259,7 @@ def sitl(
 
     config = parse(_tables(fleet), fleet.name)
     parameters = parse_parameters(parameter or ())
-    settings = SitlSettings(check_build(px4), truth.parent, truth, sys.stdin.fileno(), parameters)
+    settings = SitlSettings(check_build(px4), truth.parent, truth, sys.stdin.fileno(), parameters, ready)
     SitlHost(config, settings).run(grace_s=1.5)
 
 
