@@ -1,6 +1,7 @@
 """Nobody takes off before the parameters that the launcher sets are read back as set."""
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ pytestmark = [pytest.mark.process, pytest.mark.timeout(400)]
 def fly(folder: Path, *more: str) -> Any:
     """`fleet up` on one stand-in for PX4, on PX4's own ports."""
     tables = {
-        "fleet": {"name": f"launched-{folder.name}"[:64], "origin": {
+        "fleet": {"name": f"launched-{os.getpid()}-{folder.name[-1]}", "origin": {
             "latitude_deg": 47.397742, "longitude_deg": 8.545594, "altitude_amsl_m": 488.0,
         }},
         "formation": {"shape": "v", "altitude_m": 2.0},
@@ -60,6 +61,6 @@ def test_whichever_name_of_a_setting_this_px4_has_is_read_back_and_then_it_takes
     tmp_path: Path, version: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(VERSION, version)
-    done = fly(tmp_path, "--for", "1", "--parameter", "COM_OF_LOSS_T=0.9")
+    done = fly(tmp_path, "--for", "6", "--parameter", "COM_OF_LOSS_T=0.9")
     assert commands(tmp_path)[0] == "takeoff", done.stderr
     assert armed(tmp_path)
