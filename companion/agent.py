@@ -272,7 +272,7 @@ class Agent:
             "phase": self.phase.name.lower(),
             "in_order": in_order,
             "revision": self.programme.newest.revision,
-            "place": self.orders.place(self.flight.begun),
+            "place": [*self.orders.place(self.flight.begun)],
         }
         return json.dumps(answer).encode()
 
@@ -729,7 +729,7 @@ class Agent:
             "revision": self.programme.newest.revision,
             "fleet": self.config.fleet.name,
             "up_s": 0.0 if self._began_ns is None else (now.monotonic_ns - self._began_ns) * 1e-9,
-            "place": self.orders.place(self.flight.begun),
+            "place": [*self.orders.place(self.flight.begun)],
             "shape": self.programme.newest.shape,
             "moving": self.programme.newest.end_ns is None or bool(self.programme.newest.legs),
             "position_error_m": tick.position_error_m if tick else None,
