@@ -55,7 +55,7 @@ from companion.core.values import (
 )
 from companion.errors import ConfigError, WireError
 from companion.flight import Flight
-from companion.orders import ORDER_FAULTS, REVISION_JUMP_MAX, Order, OrderBook, read_order
+from companion.orders import ORDER_FAULTS, Order, OrderBook, read_order, revision_fault
 from companion.preflight import Account, Check, assignment_hash, own_checks, unmet
 from companion.wire.mavlink import MavlinkLink, mode_name
 from companion.wire.peer import WIRE_FAULTS, decode_motion, decode_state, encode_motion, encode_state
@@ -149,7 +149,7 @@ class Agent:
         """what is flown, before the filter; tests and studies may put another in its place"""
         self.safety = SafetyFilter(config.safety_limits)
         self.flight = Flight(config, vehicle_id, self.autopilot, self.programme, self.peers, self._restart_filter)
-        self.orders = OrderBook()
+        self.orders = OrderBook(boot_id)
         self.trigger = config.trigger_rule
         self.near = NearMode(config.near_rate)
         self.messages_sent = 0
@@ -165,6 +165,8 @@ class Agent:
         self._filter = (SendFilter(), SendFilter(), SendFilter())
         self._position_came = False
         self._last_tick: Instant | None = None
+        self._began_ns: int | None = None
+        """when this agent first acted (monotonic)"""
         self._observed_ns: int | None = None
         """when the own state was last known"""
         self._tick: Tick | None = None
@@ -255,15 +257,15 @@ class Agent:
         again = self.orders.answer_again(payload)
         if again is not None:
             return again
-        order = read_order(payload)
+        order = read_order(payload, self.id)
         if isinstance(order, Refusal):
             return self._refuse(order)
-        refusal = self.orders.refusal(order)
+        refusal = self.orders.refusal(order, self.flight.begun)
         if refusal is not None:
-            return self._refuse(refusal)
+            return self._refuse(refusal, in_order=False)
         reason = self._obey(order, now)
         if reason is None:
-            self.orders.obeyed(order)
+            self.orders.obeyed_now(order)
         answer = self._reply(reason)
         self.orders.answered(payload, answer)
         return answer
@@ -289,18 +291,19 @@ class Agent:
             return str(error)
         return self._consider(motion, now)
 
-    def _refuse(self, refusal: Refusal) -> bytes:
+    def _refuse(self, refusal: Refusal, in_order: bool = True) -> bytes:
         self.rejected[f"command: {refusal.kind}"] += 1
-        return self._reply(refusal.sentence)
+        return self._reply(refusal.sentence, in_order)
 
-    def _reply(self, refusal: str | None) -> bytes:
+    def _reply(self, refusal: str | None, in_order: bool = True) -> bytes:
         answer = {
             "vehicle": self.id,
             "accepted": refusal is None,
             "reason": refusal,
             "phase": self.phase.name.lower(),
+            "in_order": in_order,
             "revision": self.programme.newest.revision,
-            "command": [self.orders.revision, self.orders.issuer],
+            "place": [*self.orders.place(self.flight.begun)],
         }
         return json.dumps(answer).encode()
 
@@ -395,10 +398,10 @@ class Agent:
         return None
 
     def _unsound(self, motion: Motion, now: Instant) -> Refusal | None:
-        if motion.revision > self.programme.newest.revision + REVISION_JUMP_MAX:
-            return Refusal(
-                RefusalKind.REVISION, f"its revision {motion.revision} is more than {REVISION_JUMP_MAX} ahead"
-            )
+        told = [s.revision for i in self.peers.ids if (s := self.peers.sample(i)) is not None]
+        fault = revision_fault(motion.revision, self.programme.newest.revision, told)
+        if fault is not None:
+            return Refusal(RefusalKind.REVISION, fault)
         if set(motion.slots) != set(self.programme.newest.slots):
             return Refusal(RefusalKind.VEHICLES, "its vehicles are not this fleet's")
         if abs(motion.start_ns - now.fleet_ns) > 3_600_000_000_000:
@@ -557,6 +560,8 @@ class Agent:
 
     def advance(self, now: Instant) -> Outputs:
         """Do what is due; the returned outputs are to be sent in their order."""
+        if self._began_ns is None:
+            self._began_ns = now.monotonic_ns
         since = None if self._last_tick is None else now.monotonic_ns - self._last_tick.monotonic_ns
         if self._position_came or since is None or since >= self._timer_ns:
             self._control(now, since)
@@ -767,7 +772,9 @@ class Agent:
             "ready": [c.says for c in unready],
             "unfit": [c.says for c in unready if c.lasting],
             "revision": self.programme.newest.revision,
-            "command": [self.orders.revision, self.orders.issuer],
+            "fleet": self.config.fleet.name,
+            "up_s": 0.0 if self._began_ns is None else (now.monotonic_ns - self._began_ns) * 1e-9,
+            "place": [*self.orders.place(self.flight.begun)],
             "shape": self.programme.newest.shape,
             "moving": self.programme.newest.end_ns is None or bool(self.programme.newest.legs),
             "position_error_m": tick.position_error_m if tick else None,

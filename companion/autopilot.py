@@ -1,16 +1,18 @@
 """What we know of our autopilot and what we have asked of it. Sans-I/O; used by the agent alone.
 
 PX4's quirks that shape it: an answer to a command names only the command, so commands of one kind are asked one after
-another; GPS_GLOBAL_ORIGIN comes once after boot and must be requested; LOCAL_POSITION_NED says nothing of its validity.
+another; GPS_GLOBAL_ORIGIN comes once after boot and must be requested; LOCAL_POSITION_NED says nothing of its validity;
+what a command has done shows in the next HEARTBEAT, which comes once a second.
 """
 
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from math import inf
+from math import dist, inf
+from typing import NamedTuple
 
 from companion.core.counts import Counts
-from companion.core.failsafe import STATUS_S
+from companion.core.failsafe import DAMAGE_M, STATUS_S
 from companion.core.frames import Geodetic, LocalFrame, Ned
 from companion.core.values import ZERO, Instant
 from companion.preflight import (
@@ -21,12 +23,17 @@ from companion.preflight import (
     PARAMETERS,
     POSITION_LIMIT_S,
     AutopilotFacts,
+    same_setting,
 )
 from companion.wire import mavlink as wire
 from companion.wire.mavlink import MavlinkLink, Px4Mode
 
 RETRY_S = 0.5
 TRIES = 8
+ANSWER_S = 1.0
+"""what is asked once is taken for not answered after this; preflight allows a link no such round trip"""
+EFFECT_S = 0.2
+"""a HEARTBEAT this much later than an answer knows of what was answered: PX4 makes the two in different threads"""
 PARAMETER_TRIES = 6
 PARAMETERS_AT_ONCE = 3
 """requests on the way at a time: a serial line carries the positions too"""
@@ -40,6 +47,9 @@ RATE_WINDOW_NS = 2_000_000_000
 LATENCY_WINDOW_NS = 1_000_000_000
 """short, since a simulated autopilot's clock may run several per cent slow: what it falls behind within the window
 counts as delay"""
+BOOT_MS_ROUND = 1 << 32
+BOOT_MS_SLACK = 2_000
+"""clocks and links differ by less than this between two positions (ms); no autopilot boots faster and speaks"""
 ACCEPTED, TEMPORARILY_REJECTED, IN_PROGRESS = 0, 1, 5
 
 
@@ -55,10 +65,26 @@ COUNTED = (
 class _Request:
     name: str
     make: Callable[[], bytes]
+    once: bool = False
+    """whether it may have been done though its answer is lost, and must not be done twice"""
     tries: int = 0
     next_ns: int = 0
     withdrawn: bool = False
     """asked, and wanted no longer: it waits for its answer only"""
+
+    @property
+    def given_up(self) -> bool:
+        """Whether it is not sent again without an answer."""
+        return self.withdrawn or self.tries >= (1 if self.once else TRIES)
+
+
+class Outcome(NamedTuple):
+    """What came of a request that the autopilot has not refused."""
+
+    since_ns: int
+    """when it was accepted, or taken for not answered (monotonic)"""
+    accepted: bool
+    """False: sent once and not answered, so that nobody knows whether it was done"""
 
 
 @dataclass(slots=True)
@@ -91,7 +117,10 @@ class BootClock:
 
 @dataclass(slots=True)
 class ParameterReader:
-    """Reads the parameters that preflight looks at, in rounds; one that never comes is missing until it does."""
+    """Reads the parameters that preflight looks at, in rounds; one that never comes is missing until it does.
+
+    Of the names of one setting the one that has answered is read on, and the others are not asked for.
+    """
 
     values: dict[str, float | int] = field(default_factory=dict)
     missing: set[str] = field(default_factory=set)
@@ -110,13 +139,16 @@ class ParameterReader:
         """A value that came, asked for or not."""
         if name in PARAMETERS:
             self.values[name] = value
-            self.missing.discard(name)
-            self._open.pop(name, None)
+            for other in same_setting(name):
+                self.missing.discard(other)
+                self._open.pop(other, None)
 
     def due(self, now_ns: int) -> list[str]:
         """Names to ask for now."""
         if not self._open and now_ns >= self._round_ns:
-            self._open = dict.fromkeys(PARAMETERS, (0, 0))
+            known = self.values.keys()
+            wanted = [n for n in PARAMETERS if n in known or known.isdisjoint(same_setting(n))]
+            self._open = dict.fromkeys(wanted, (0, 0))
         asked = []
         for name, (tries, next_ns) in list(self._open.items())[:PARAMETERS_AT_ONCE]:
             if now_ns < next_ns:
@@ -171,6 +203,8 @@ class AutopilotClient:
         self.foreign_ns: int | None = None
         """when an autopilot of another system id last spoke (monotonic ns)"""
         self.origin: Geodetic | None = None
+        self.origin_crept_ned_m = ZERO
+        """how far the origin has moved so far in steps too small for a jump of the position"""
         self.frame: LocalFrame | None = None if fleet_origin is not None else LocalFrame(ZERO)
         self.boot = BootClock()
         self.heartbeat_ns: int | None = None
@@ -182,6 +216,8 @@ class AutopilotClient:
         self._queues: dict[int, deque[_Request]] = {}
         self._refused: dict[str, int] = {}
         """name of a request -> when it may be asked again after a refusal (monotonic ns)"""
+        self._outcomes: dict[str, Outcome] = {}
+        self._mode_asked: Px4Mode | None = None
         self._now_ns = 0
         self._next_heartbeat_ns = 0
         self._next_origin_ns = 0
@@ -256,24 +292,39 @@ class AutopilotClient:
         for message_id in wire.STREAMS_OFF:
             self.ask(f"stream {message_id}", *wire.interval_parameters(message_id, 0.0))
 
+    def _unwrapped(self, boot_ms: int, now: Instant) -> int:
+        """Time since boot whose 32 bit go round every 49.7 days, gone on with.
+
+        A small number after a large one is a reboot, unless it is as much later as time has passed here.
+        """
+        last = self.boot.last_boot_ms
+        if last < 0:
+            return boot_ms
+        on = last - last % BOOT_MS_ROUND + boot_ms
+        passed_ms = (now.monotonic_ns - self._arrivals_ns[-1]) // 1_000_000 if self._arrivals_ns else 0
+        later_ms = on + BOOT_MS_ROUND - last
+        return on + BOOT_MS_ROUND if on < last - 1000 and later_ms <= passed_ms + BOOT_MS_SLACK else on
+
     def _position(self, event: wire.LocalPosition, now: Instant) -> bool:
-        if event.boot_ms < self.boot.last_boot_ms - 1000:
+        boot_ms = self._unwrapped(event.boot_ms, now)
+        if boot_ms < self.boot.last_boot_ms - 1000:
             self.notes.append("autopilot rebooted")
             self.counts["autopilot reboot"] += 1
             self.boot.restart()
+            boot_ms = event.boot_ms
             self.origin = None
             if self.fleet_origin is not None:
                 self.frame = None
-            self._queues.clear()
+            self.cancel()
             self.parameters.restart()
             self._round_trips_ns.clear()
             self._clock_ahead_ns.clear()
             self.home_altitude_amsl_m = None
             self._set_up()
-        elif event.boot_ms <= self.boot.last_boot_ms:
+        elif boot_ms <= self.boot.last_boot_ms:
             self.counts["position repeated"] += 1
             return False
-        made_ns = self.boot.arrived(event.boot_ms, now.monotonic_ns)
+        made_ns = self.boot.arrived(boot_ms, now.monotonic_ns)
         self._arrivals_ns.append(now.monotonic_ns)
         if self.frame is None:
             return False
@@ -290,11 +341,14 @@ class AutopilotClient:
         self._origin_doubted = False
         if self.fleet_origin is None or origin == self.origin:
             return
-        if self.origin is not None:
+        before, self.frame = self.frame, LocalFrame.from_origins(origin, self.fleet_origin)
+        if self.origin is not None and before is not None:
             self.notes.append("estimator origin moved")
             self.counts["estimator origin moved"] += 1
+            was, is_, crept = before.to_fleet(ZERO), self.frame.to_fleet(ZERO), self.origin_crept_ned_m
+            if dist(was, is_) < DAMAGE_M:
+                self.origin_crept_ned_m = Ned(*(c + b - a for a, b, c in zip(was, is_, crept, strict=True)))
         self.origin = origin
-        self.frame = LocalFrame.from_origins(origin, self.fleet_origin)
 
     def _time_answer(self, event: wire.TimeAnswer, now: Instant) -> None:
         if event.asked_ns not in self._round_trips_open_ns:
@@ -315,44 +369,71 @@ class AutopilotClient:
         if request.withdrawn:
             queue.popleft()
             return
-        if event.result in (TEMPORARILY_REJECTED, IN_PROGRESS) and request.tries < TRIES:
-            request.next_ns = now.monotonic_ns + round(RETRY_S * 1e9)
+        if request.once and event.result == TEMPORARILY_REJECTED:
+            # It was certainly not done, and may be asked anew.
+            queue.popleft()
+            self._refused[request.name] = now.monotonic_ns + round(RETRY_S * 1e9)
+            return
+        if event.result in (TEMPORARILY_REJECTED, IN_PROGRESS) and (request.once or request.tries < TRIES):
+            request.next_ns = now.monotonic_ns + round((ANSWER_S if request.once else RETRY_S) * 1e9)
             return
         queue.popleft()
-        if event.result != ACCEPTED:
+        if event.result == ACCEPTED:
+            self._outcomes[request.name] = Outcome(now.monotonic_ns, accepted=True)
+        else:
             self._refused[request.name] = now.monotonic_ns + round(RETRY_S * 1e9)
             self.counts[f"refused: {request.name.split()[0]}"] += 1
             if not request.name.startswith("stream"):
                 self.notes.append(f"autopilot refused {request.name} (result {event.result})")
 
-    def ask(self, name: str, command: int, *parameters: float) -> None:
-        """Ask for a command, retried until answered; the same name is not queued twice, nor right after a refusal."""
-        if self._now_ns < self._refused.get(name, 0):
+    def ask(self, name: str, command: int, *parameters: float, once: bool = False) -> None:
+        """Ask for a command, retried until answered.
+
+        The same name is not queued twice, nor right after a refusal, nor, once accepted, before a heartbeat could have
+        shown what came of it. `once`: it is sent a single time, unless the answer says that it was not done.
+        """
+        if self._now_ns < self._refused.get(name, 0) or self._effect_is_open(name):
             return
         queue = self._queues.setdefault(command, deque())
         if all(r.name != name for r in queue):
-            queue.append(_Request(name, lambda: self.link.command(command, *parameters)))
+            queue.append(_Request(name, lambda: self.link.command(command, *parameters), once))
+
+    def outcome(self, name: str) -> Outcome | None:
+        """What came of a request, once a heartbeat has come that knows of it; None before, and where it was refused."""
+        return None if self._effect_is_open(name) else self._outcomes.get(name)
+
+    def _effect_is_open(self, name: str) -> bool:
+        """Whether a request was accepted, or may have been, and no heartbeat that knows of it has come yet."""
+        outcome = self._outcomes.get(name)
+        if outcome is None or self.heartbeat_ns is None:
+            return outcome is not None
+        return self.heartbeat_ns < outcome.since_ns + (round(EFFECT_S * 1e9) if outcome.accepted else 0)
 
     def set_mode(self, mode: Px4Mode) -> None:
-        """Ask for a flight mode; one asked for before and not answered is dropped."""
+        """Ask for a flight mode; one asked for before is forgotten."""
         command, *parameters = wire.mode_parameters(mode)
-        queue = self._queues.get(command)
-        if queue and queue[0].name != mode.name:
-            queue.clear()
+        if self._mode_asked is not None and self._mode_asked is not mode:
+            self._queues[command].clear()
+            self._outcomes.pop(self._mode_asked.name, None)
+        self._mode_asked = mode
         self.ask(mode.name, command, *parameters)
 
     def withdraw(self, *names: str) -> None:
         """Ask no more for what is wanted no longer, or was seen to be done though its answer was lost."""
+        for name in names:
+            self._outcomes.pop(name, None)
         for queue in self._queues.values():
             for request in [r for r in queue if r.name in names]:
                 if request.tries == 0:
                     queue.remove(request)
                 else:
-                    request.tries, request.withdrawn = TRIES, True
+                    request.withdrawn = True
 
     def cancel(self) -> None:
         """Ask for nothing more: the vehicle is somebody else's now."""
         self._queues.clear()
+        self._outcomes.clear()
+        self._mode_asked = None
 
     def due(self, now: Instant) -> list[bytes]:
         """Datagrams to send now: heartbeat at 1 Hz, requests with their retries."""
@@ -367,14 +448,16 @@ class AutopilotClient:
             self._next_origin_ns = now.monotonic_ns + 1_000_000_000
             out.append(self.link.command(*wire.request_message_parameters(wire.ORIGIN_MESSAGE_ID)))
         for queue in self._queues.values():
-            while queue and queue[0].tries >= TRIES and now.monotonic_ns >= queue[0].next_ns:
+            while queue and queue[0].given_up and now.monotonic_ns >= queue[0].next_ns:
                 request = queue.popleft()
                 if not request.withdrawn:
+                    if request.once:
+                        self._outcomes[request.name] = Outcome(now.monotonic_ns, accepted=False)
                     self.counts["unanswered"] += 1
                     self.notes.append(f"autopilot never answered {request.name}")
             if queue and now.monotonic_ns >= queue[0].next_ns:
                 queue[0].tries += 1
-                queue[0].next_ns = now.monotonic_ns + round(RETRY_S * 1e9)
+                queue[0].next_ns = now.monotonic_ns + round((ANSWER_S if queue[0].once else RETRY_S) * 1e9)
                 out.append(queue[0].make())
         if not self.armed:
             out += self._preflight_due(now.monotonic_ns)

@@ -297,6 +297,8 @@ class StubTable(_Table):
     origin_scatter_m: NotNegative = 5.0
     """how far each estimator's origin lies from its vehicle's pad"""
     dynamics: Literal["px4", "ideal"] = "px4"
+    px4_version: Literal["1.16", "1.18"] = "1.16"
+    """whose parameters the stubs have"""
 
 
 class VehicleTable(_Table):

@@ -15,6 +15,7 @@ from companion.core.events import Event, FailsafeActed, KillCause, Killed, Phase
 from companion.core.failsafe import (
     BATTERY_S,
     CLIMB_S,
+    CREEP_LIMIT_M,
     FAILSAFES,
     FROZEN_S,
     HEARTBEAT_S,
@@ -26,6 +27,7 @@ from companion.core.failsafe import (
     Action,
     Failsafe,
 )
+from companion.core.frames import Ned
 from companion.core.health import Persistence, PositionWatch
 from companion.core.neighbours import PeerTable
 from companion.core.phase import PhaseEvent, next_phase
@@ -64,14 +66,15 @@ ENGAGED_AWAY_M = 3.0
 """whoever engages so far from its slot comes to it by a way of its own"""
 RESUME_LIMIT_NS = 5_000_000_000
 RELEASE_LIMIT_NS = 4_000_000_000
-LATE_OFFBOARD_NS = 1_000_000_000
-"""OFFBOARD that was asked for and is wanted no longer may come so late"""
+LATE_MODE_NS = 1_000_000_000
+"""a mode that was asked for and is wanted no longer may come so late"""
+LATE_MODES = frozenset({Px4Mode.OFFBOARD, Px4Mode.AUTO_TAKEOFF})
 KILL_LIMIT_NS = 10_000_000_000
 FALL_M_S = 4.0
 """no autopilot sinks so fast on its own motors (PX4's limits of descent end there): who does falls"""
 FALL_NS = 10_000_000_000
 """a fall so shortly before or after the motors were seen to stop has to do with it"""
-ON_GROUND = 1
+LANDED_STATE_UNKNOWN, ON_GROUND = 0, 1
 BEING_KILLED = "it is being killed"
 
 
@@ -121,6 +124,8 @@ class Flight:
     """a peer holds a newer motion than we do"""
     formation_since_ns: int | None = None
     phase_since_ns: int = 0
+    begun: int = 0
+    """flights so far: take-offs commanded and resumptions"""
     positions: PositionWatch = field(init=False)
     _orders: _Orders = field(default_factory=_Orders)
     _fell_ns: int | None = None
@@ -141,6 +146,8 @@ class Flight:
     _alone_since_ns: int | None = None
     _jumps: int = 0
     _first_jump_ns: int | None = None
+    _origin_crept_ned_m: Ned = ZERO
+    """of the autopilot, when it was last engaged"""
     _last_jump_ns: int = 0
     _engages: bool = False
     _slot: tuple[int, Reference] | None = None
@@ -185,6 +192,8 @@ class Flight:
         """Arm and climb."""
         if self._orders.kill_ns is not None:
             return BEING_KILLED
+        self._orders.release_ns = None
+        self.autopilot.withdraw(Px4Mode.AUTO_LOITER.name)
         self._happened(PhaseEvent.TAKE_OFF, now)
         return None
 
@@ -230,6 +239,8 @@ class Flight:
             return f"it is {self.phase.name.lower()}: to resume is for the released, and for those found in the air"
         if not self._in_the_air:
             return "it is on the ground"
+        if self.autopilot.landed_state == LANDED_STATE_UNKNOWN:
+            return "its autopilot does not tell whether it is in the air"
         if self.autopilot.state(now) is None or self.positions.frozen:
             return "no position"
         self._orders.release_ns = None
@@ -267,6 +278,7 @@ class Flight:
             self.killed = self._fell_ns = self._disarmed_ns = None
         self.phase = after
         self.phase_since_ns = now.monotonic_ns
+        self.begun += event in (PhaseEvent.TAKE_OFF, PhaseEvent.RESUMED)
         if after is Phase.ARMED:
             self._mode_before = ap.custom_mode
         elif before is not Phase.ARMED:
@@ -280,6 +292,7 @@ class Flight:
             self.formation_since_ns = now.fleet_ns
             self._engages = event is PhaseEvent.ENGAGED
             self._alone_since_ns = self._first_jump_ns = None
+            self._origin_crept_ned_m = ap.origin_crept_ned_m
         if after is Phase.LANDING:
             self._land_seen = False
         if after is Phase.RELEASED:
@@ -378,11 +391,11 @@ class Flight:
                 ap.ask("kill", *wire.kill_parameters())
         if orders.release_ns is not None:
             left = ap.custom_mode not in orders.modes_to_leave
-            if now.monotonic_ns - orders.release_ns > (LATE_OFFBOARD_NS if left else RELEASE_LIMIT_NS):
+            if now.monotonic_ns - orders.release_ns > (LATE_MODE_NS if left else RELEASE_LIMIT_NS):
                 orders.release_ns = None
                 ap.withdraw(Px4Mode.AUTO_LOITER.name)
             elif left:
-                orders.modes_to_leave &= {Px4Mode.OFFBOARD}
+                orders.modes_to_leave &= LATE_MODES
                 ap.withdraw(Px4Mode.AUTO_LOITER.name)
             else:
                 ap.set_mode(Px4Mode.AUTO_LOITER)
@@ -408,13 +421,23 @@ class Flight:
         elif ap.custom_mode == Px4Mode.OFFBOARD:
             # Left over from a flight before; without setpoints PX4 does not arm in it.
             ap.set_mode(Px4Mode.AUTO_LOITER)
+        elif (outcome := ap.outcome("arming")) is not None:
+            # Whoever disarms has the last word; an arming that was not answered may have been done, and undone by him.
+            what = "disarmed again after it was armed" if outcome.accepted else "the arming was not answered"
+            self._fail(Failsafe.NOT_ARMED, now, f"{what}; the take-off is given up")
+            self._happened(PhaseEvent.GIVEN_UP, now)
         else:
-            ap.ask("arming", *wire.arm_parameters(True))
+            ap.ask("arming", *wire.arm_parameters(True), once=True)
+
+    def _disarmed_early(self, now: Instant) -> None:
+        """A take-off that its pilot has ended by disarming; take-off mode would take off whoever arms next."""
+        self._happened(PhaseEvent.DISARMED, now)
+        self._hold_mode_after({Px4Mode.AUTO_TAKEOFF}, now)
 
     def _watch_take_off(self, now: Instant) -> None:
         ap = self.autopilot
         if not ap.armed:
-            self._happened(PhaseEvent.DISARMED, now)
+            self._disarmed_early(now)
         elif ap.custom_mode == Px4Mode.AUTO_TAKEOFF:
             self._happened(PhaseEvent.TAKING_OFF, now)
         elif ap.custom_mode not in OUR_MODES and ap.custom_mode != self._mode_before:
@@ -430,7 +453,7 @@ class Flight:
     def _watch_climb(self, now: Instant, positioned: bool) -> None:
         ap = self.autopilot
         if not ap.armed:
-            self._happened(PhaseEvent.DISARMED, now)
+            self._disarmed_early(now)
             return
         if ap.custom_mode == Px4Mode.OFFBOARD:
             self._happened(PhaseEvent.ENGAGED, now)
@@ -514,6 +537,10 @@ class Flight:
         uncertain = not (flags & ap.flags_needed == ap.flags_needed and accuracy_m <= ACCURACY_LIMIT_M)
         if self._uncertain.holds(uncertain, now.monotonic_ns):
             self._fail(Failsafe.COVARIANCE, now, f"{accuracy_m:.1f} m, flags {flags:#x}")
+            return False
+        crept_m = dist(ap.origin_crept_ned_m, self._origin_crept_ned_m)
+        if crept_m > CREEP_LIMIT_M:
+            self._fail(Failsafe.COVARIANCE, now, f"estimator's origin has crept {crept_m:.1f} m")
             return False
         if self.positions.jumps != self._jumps:
             self._jump(now)

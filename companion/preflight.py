@@ -33,17 +33,20 @@ ROUNDING = 1e-6
 """relative: PX4's parameters are float32"""
 
 
+_Text = Annotated[str, Field(max_length=4000)]
+
+
 @dataclass(frozen=True, slots=True)
 class Check:
     """One row: what was looked at, what it was, what it may be."""
 
-    name: str
-    value: float | int | str | None
+    name: _Text
+    value: float | Annotated[int, Field(ge=-(1 << 63), lt=1 << 63)] | _Text | None
     """None: not known"""
-    limit: str
+    limit: _Text
     """what is allowed, with its unit"""
     met: bool
-    says: str
+    says: _Text
     """the fault as a sentence; of no meaning when met"""
     lasting: bool = False
     """whether it cannot come right by waiting"""
@@ -254,9 +257,16 @@ class Rule(NamedTuple):
 
 PARAMETERS = (
     "COM_OF_LOSS_T", "COM_OBL_RC_ACT", "COM_RC_OVERRIDE", "NAV_RCL_ACT", "COM_RCL_EXCEPT", "NAV_DLL_ACT", "GF_ACTION",
-    "COM_LOW_BAT_ACT", "COM_DISARM_LAND", "MPC_XY_VEL_MAX", "MPC_Z_VEL_MAX_UP", "MPC_Z_VEL_MAX_DN",
+    "COM_LOW_BAT_ACT", "COM_DISARM_LAND", "MPC_XY_VEL_MAX", "MPC_Z_VEL_MAX_UP", "MPC_Z_VEL_MAX_DN", "MAN_OVERRIDE_SPD",
 )  # fmt: skip
 """PX4 parameters that preflight reads"""
+ALTERNATIVES = (("COM_RC_OVERRIDE", "MAN_OVERRIDE_SPD"),)
+"""names under which PX4's versions have one setting (the second since v1.18): whichever answers counts"""
+
+
+def same_setting(name: str) -> tuple[str, ...]:
+    """All names of a parameter's setting, its own included."""
+    return next((names for names in ALTERNATIVES if name in names), (name,))
 
 
 def _one_of(*allowed: int) -> tuple[str, Callable[[float], bool]]:
@@ -296,6 +306,7 @@ def parameter_rules(config: FleetConfig, on_loss: float | None = None) -> dict[s
             "the others of a way back",
         ),
         "COM_RC_OVERRIDE": Rule("has bit 1", lambda v: bool(int(v) & 2), "a pilot's sticks would not end OFFBOARD"),
+        "MAN_OVERRIDE_SPD": Rule(">= 0", lambda v: v >= 0.0, "a pilot's sticks would not end OFFBOARD"),
         "NAV_RCL_ACT": Rule(
             *(_one_of(1, 2, 3) if pilot else _one_of(0, 1, 2, 3)), "lost RC must not end in a fall, nor in nothing"
         ),
@@ -314,7 +325,7 @@ def parameter_rules(config: FleetConfig, on_loss: float | None = None) -> dict[s
 
 
 def _parameter_checks(facts: AutopilotFacts, config: FleetConfig) -> Iterator[Check]:
-    waiting = []
+    waiting = set()
     for name, rule in parameter_rules(config, facts.parameters.get("COM_OBL_RC_ACT")).items():
         value = facts.parameters.get(name)
         if value is not None:
@@ -323,13 +334,18 @@ def _parameter_checks(facts: AutopilotFacts, config: FleetConfig) -> Iterator[Ch
             if rule.limit.startswith("has "):
                 says = f"{name} is {value:g}, must have {rule.limit[4:]}: {rule.why}"
             yield Check(name, tidy(value), rule.limit, met, says, lasting=True)
-        elif name in facts.missing:
-            yield Check(name, None, rule.limit, False, f"{name} cannot be read")
-        else:
-            waiting.append(name)
+            continue
+        names = same_setting(name)
+        if not facts.parameters.keys().isdisjoint(names):
+            continue  # another version's name of it has answered
+        if not facts.missing.issuperset(names):
+            waiting.add(names)
+        elif name == names[0]:
+            yield Check(name, None, rule.limit, False, f"{' or '.join(names)} cannot be read")
     if waiting:
-        says = f"{len(waiting)} of {len(PARAMETERS)} parameters not read yet"
-        yield Check("parameters", len(PARAMETERS) - len(waiting), f"= {len(PARAMETERS)} read", False, says)
+        wanted = len({same_setting(name) for name in PARAMETERS})
+        says = f"{len(waiting)} of {wanted} parameters not read yet"
+        yield Check("parameters", wanted - len(waiting), f"= {wanted} read", False, says)
 
 
 def _level(p: Ned) -> float:
@@ -363,7 +379,12 @@ def assignment_hash(config: FleetConfig) -> str:
     return blake2s(text.replace("-0.000", "0.000").encode(), digest_size=8).hexdigest()
 
 
-_Coordinate = Annotated[float, Field(allow_inf_nan=False)]
+# Bounds that every true answer keeps by far, and within which what is computed from it cannot overflow.
+_Coordinate = Annotated[float, Field(ge=-1e8, le=1e8, allow_inf_nan=False)]
+_Id = Annotated[int, Field(ge=0, le=255)]
+_Word = Annotated[str, Field(max_length=64)]
+_Unsigned32 = Annotated[int, Field(ge=0, lt=1 << 32)]
+_TimeNs = Annotated[int, Field(ge=0, lt=1 << 63)]
 _Place = tuple[_Coordinate, _Coordinate, _Coordinate]
 
 
@@ -372,14 +393,14 @@ class Account(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
-    vehicle: int
-    boot_id: int
-    system_id: int
-    configuration: str
-    assignment: str
+    vehicle: _Id
+    boot_id: _Unsigned32
+    system_id: _Id
+    configuration: _Word
+    assignment: _Word
     flying: bool
     """whether it flies on its companion's command"""
-    revision: int
+    revision: _Unsigned32
     """of its newest motion"""
     position_ned_m: _Place | None
     """fleet frame"""
@@ -398,9 +419,9 @@ class ClockReading(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
-    boot_id: int
-    received_ns: int
-    answered_ns: int
+    boot_id: _Unsigned32
+    received_ns: _TimeNs
+    answered_ns: _TimeNs
 
 
 def as_json(check: Check) -> dict[str, Any]:

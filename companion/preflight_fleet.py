@@ -78,16 +78,22 @@ def fleet_report(
     accounts: Mapping[int, Account | None],
     offsets: Mapping[int, ClockOffset | None],
     boots: Mapping[int, frozenset[int]],
+    unreadable: Mapping[int, str] | None = None,
 ) -> Report:
-    """All rows: `accounts` by vehicle id (None: silent), `boots`: the processes that answered under each id."""
+    """All rows: `accounts` by vehicle id (None: silent), `boots`: the processes that answered under each id;
+    `unreadable`: what is wrong with an answer of another form."""
     heard = {i: a for i, a in accounts.items() if a is not None}
-    silent = [i for i, a in accounts.items() if a is None]
+    unreadable = unreadable or {}
+    silent = [i for i, a in accounts.items() if a is None and i not in unreadable]
     rows = [
         Check(
             "vehicles heard", len(heard), f"= {len(accounts)}", not silent,
             f"not heard: vehicle {', '.join(str(i) for i in silent)}",
         )
     ]  # fmt: skip
+    for i, why in unreadable.items():
+        says = f"its answer cannot be read ({why}): is its companion of another version?"
+        rows.append(Check("answer", None, "of this version's form", False, says, True, i))
     for account in heard.values():
         rows += account.checks
     rows += _identities(config, heard, boots)

@@ -27,6 +27,9 @@ OneVehicle = Annotated[int | None, typer.Option(min=1, max=250, help="This vehic
 Parameters = Annotated[
     list[str] | None, typer.Option(metavar="NAME=VALUE", help="With --autopilot px4: a PX4 parameter, repeatable.")
 ]
+Both = Annotated[
+    bool, typer.Option("--both", help="Also where two companions answer as one vehicle: command both of them.")
+]
 DEFAULT_FILE = Path("fleet.toml")
 CROWD_PER_CORE = 8
 CROWD_RATE_HZ = 20.0
@@ -131,6 +134,7 @@ def up(
     """
     from sim.faults import load_scenario
     from sim.launch import FlightOptions, flight_folder, fly
+    from sim.lock import only_flight, refuse_companions
     from sim.sitl import check_build, parse_parameters
     from sim.stub_fleet import check_stub_links
     from sim.view import FlightView, show_summary
@@ -161,12 +165,14 @@ def up(
     elif gcs or scenario is not None:
         raise ConfigError("--gcs and --scenario are for --autopilot stub: a PX4 speaks to the ground station by itself")
     faults = () if scenario is None else load_scenario(scenario, config)
-    options = FlightOptions(
-        flight_folder(out), seed, duration, px4, tuple(parameter or ()), autopilot == "external", gcs, faults
-    )
     interrupted = _interrupts()
-    with FlightView(quiet=as_json) as view:
-        summary = fly(tables, options, view.show, interrupted)
+    with only_flight(config.fleet.name):
+        refuse_companions(config)
+        options = FlightOptions(
+            flight_folder(out), seed, duration, px4, tuple(parameter or ()), autopilot == "external", gcs, faults
+        )
+        with FlightView(quiet=as_json) as view:
+            summary = fly(tables, options, view.show, interrupted)
     if as_json:
         typer.echo(json.dumps(summary))
     else:
@@ -245,6 +251,7 @@ def sitl(
     truth: Annotated[Path, typer.Option()],
     fleet: FleetFile = DEFAULT_FILE,
     parameter: Parameters = None,
+    ready: Annotated[Path | None, typer.Option(help="A file to make once every parameter is read back.")] = None,
 ) -> None:
     """Run PX4 SITL instances until standard input closes: for launchers."""
     from companion.config import parse
@@ -252,7 +259,7 @@ def sitl(
 
     config = parse(_tables(fleet), fleet.name)
     parameters = parse_parameters(parameter or ())
-    settings = SitlSettings(check_build(px4), truth.parent, truth, sys.stdin.fileno(), parameters)
+    settings = SitlSettings(check_build(px4), truth.parent, truth, sys.stdin.fileno(), parameters, ready)
     SitlHost(config, settings).run(grace_s=1.5)
 
 
@@ -292,7 +299,7 @@ def study(
 # -- the operator's verbs --------------------------------------------------------------------------------------------
 
 
-def _operate(fleet: Path, vehicles: int | None, verb: str, act: Callable[[Any], Any]) -> None:
+def _operate(fleet: Path, vehicles: int | None, verb: str, act: Callable[[Any], Any], both: bool = False) -> None:
     from companion.config import parse
     from companion.io.loop import network_settings
     from companion.io.zenoh_peers import OperatorLink
@@ -300,10 +307,10 @@ def _operate(fleet: Path, vehicles: int | None, verb: str, act: Callable[[Any], 
 
     config = parse(_tables(fleet, vehicles), fleet.name)
     with OperatorLink(network_settings(config, None)) as link:
-        operator = Operator(config, link)
+        operator = Operator(config, link, both=both)
         link.wait_alive(operator.ids, 2.0)
         answers = act(operator)
-    typer.echo(answers.sentence(verb))
+    typer.echo(f"{answers.sentence(verb)} ({operator.reached})")
     raise typer.Exit(0 if answers.all_accepted else FAILED)
 
 
@@ -328,7 +335,10 @@ def status(
     if as_json:
         typer.echo(json.dumps(answers))
     else:
+        typer.echo(operator.reached)
         show_status(answers)
+    for sentence in (*operator.left_out, *operator.two_companions):
+        typer.echo(sentence, err=True)
     raise typer.Exit(0 if all(s is not None for s in answers.values()) else FAILED)
 
 
@@ -368,9 +378,11 @@ def takeoff(fleet: FleetFile = DEFAULT_FILE, vehicles: Vehicles = None) -> None:
 
 
 @app.command()
-def land(fleet: FleetFile = DEFAULT_FILE, vehicles: Vehicles = None, vehicle: OneVehicle = None) -> None:
+def land(
+    fleet: FleetFile = DEFAULT_FILE, vehicles: Vehicles = None, vehicle: OneVehicle = None, both: Both = False
+) -> None:
     """Land every vehicle, or one, where it is."""
-    _operate(fleet, vehicles, "land", lambda o: o.land(vehicle))
+    _operate(fleet, vehicles, "land", lambda o: o.land(vehicle), both)
 
 
 @app.command()
@@ -380,9 +392,11 @@ def rtl(fleet: FleetFile = DEFAULT_FILE, vehicles: Vehicles = None) -> None:
 
 
 @app.command()
-def release(fleet: FleetFile = DEFAULT_FILE, vehicles: Vehicles = None, vehicle: OneVehicle = None) -> None:
+def release(
+    fleet: FleetFile = DEFAULT_FILE, vehicles: Vehicles = None, vehicle: OneVehicle = None, both: Both = False
+) -> None:
     """Give every vehicle, or one, to the pilot: its companion sends no setpoint, its autopilot holds."""
-    _operate(fleet, vehicles, "release", lambda o: o.release(vehicle))
+    _operate(fleet, vehicles, "release", lambda o: o.release(vehicle), both)
 
 
 @app.command()
@@ -397,12 +411,13 @@ def kill(
     vehicles: Vehicles = None,
     vehicle: OneVehicle = None,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+    both: Both = False,
 ) -> None:
     """Stop the motors of every vehicle, or of one, at once: in the air it falls."""
     whom = "every vehicle" if vehicle is None else f"vehicle {vehicle}"
     if not yes and input(f"{whom} falls from the air. Type kill to do it: ").strip() != "kill":
         raise RefusedError("kill was not confirmed")
-    _operate(fleet, vehicles, "kill", lambda o: o.kill(vehicle))
+    _operate(fleet, vehicles, "kill", lambda o: o.kill(vehicle), both)
 
 
 @app.command()

@@ -88,6 +88,7 @@ class Autopilot:
         gust: GustParameters | None = None,
         noise: NoiseParameters | None = None,
         parameters: Mapping[str, float | int] | None = None,
+        px4_version: str = "1.16",
         yaw_rad: float = 0.0,
         seed: int = 0,
     ) -> None:
@@ -107,7 +108,7 @@ class Autopilot:
         self._ekf_origin_offset_m = ekf_origin_offset_m
         self._seed = f"{seed}/{system_id}"
         self._boots = 0
-        self.parameters = ParameterTable({**(parameters or {}), "MAV_SYS_ID": system_id})
+        self.parameters = ParameterTable({**(parameters or {}), "MAV_SYS_ID": system_id}, px4_version)
         self._origin_ned_m = _plus(home_ned_m, ekf_origin_offset_m)
         start = _minus(NO_OFFSET, ekf_origin_offset_m)
         # The vehicle moves in the estimator's own frame; what is true in the fleet frame is that plus its origin.

@@ -188,11 +188,13 @@ def _fly(
     ids = [v.id for v in config.vehicles]
     processes.start("reference", "sim", "reference-loop", "--out", str(folder / "reference.bin"))
     truth = folder / "truth.bin"
+    ready = folder / "autopilots.ready" if options.px4 is not None else None
     if options.px4 is not None:
         more = [word for p in options.parameters for word in ("--parameter", p)]
         processes.start(
-            "autopilots", "sim", "sitl", "--fleet", file, "--px4", str(options.px4), "--truth", str(truth), *more
-        )
+            "autopilots", "sim", "sitl", "--fleet", file, "--px4", str(options.px4), "--truth", str(truth),
+            "--ready", str(ready), *more,
+        )  # fmt: skip
     elif not options.external:
         processes.start(
             "autopilots", "sim", "stub", "--fleet", file, "--seed", str(options.seed), "--truth", str(truth),
@@ -208,7 +210,7 @@ def _fly(
         _wait_imported(processes, folder, ids, lambda: show(_starting(began, ids)), interrupted)
     with OperatorLink(network_settings(config, None)) as link:
         operator = Operator(config, link)
-        watch = Watch(operator, processes, ids, show, began)
+        watch = Watch(operator, processes, ids, show, began, ready=ready)
         answers = watch.take_off(READY_TIMEOUT_S + READY_TIMEOUT_PER_VEHICLE_S * len(ids), interrupted)
         takeoff_ns = watch.asked_ns
         if not answers.all_accepted:
@@ -291,6 +293,8 @@ class Watch:
     ids: list[int]
     show: Callable[[Progress], None]
     began: float
+    ready: Path | None = None
+    """a file that is there once the autopilots have their parameters; None: nobody sets any here"""
     said: dict[int, dict[str, Any]] = field(default_factory=dict)
     """each vehicle's last account"""
     asked_ns: int = 0
@@ -323,11 +327,21 @@ class Watch:
             self._until_ready(deadline, interrupted)
             self.asked_ns = time.time_ns()
             try:
-                return self.operator.take_off()
+                if self._parametrised:
+                    return self.operator.take_off()
+                if (report := self.operator.preflight()).lasting:
+                    raise PreflightError(report)
             except PreflightError as error:
                 if error.report.lasting or self.clock() > deadline:
                     raise
+            # Whoever runs the autopilots says by itself, and a little later, which parameter it was.
+            if not self._parametrised and self.clock() > deadline + AUTOPILOTS_GRACE_S:
+                raise CompanionError("the autopilots' parameters were not read back as set in time; nobody took off")
             self.sleep(0.3)
+
+    @property
+    def _parametrised(self) -> bool:
+        return self.ready is None or self.ready.exists()
 
     def _until_ready(self, deadline: float, interrupted: Callable[[], bool]) -> None:
         """Wait until every vehicle says that it may take off, or one that it cannot, or the time is up."""
@@ -339,7 +353,7 @@ class Watch:
             for i, how in self.autopilots_ended().items():
                 raise CompanionError(f"vehicle {i}: {how} before take-off")
             answers = self._look("starting")
-            if all(s is not None and not s["ready"] for s in answers.values()):
+            if self._parametrised and all(s is not None and not s["ready"] for s in answers.values()):
                 return
             if interrupted():
                 raise CompanionError("interrupted before take-off")

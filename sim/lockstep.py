@@ -115,7 +115,7 @@ class Lockstep:
     _twin_line: dict[int, int] = field(default_factory=dict)
     """twin's id -> vehicle on whose autopilot's line it is"""
     _orders: int = 0
-    """revision of the last command that came without one"""
+    """commands so far that came without a place"""
     _touched: set[int] = field(default_factory=set)
     """vehicles whose deadlines may have changed"""
 
@@ -288,7 +288,7 @@ class Lockstep:
     def command(self, payload: bytes, *ids: int) -> dict[int, bytes]:
         """An operator's command to every companion that runs, or to those named; their answers.
 
-        One without a revision is made the next command.
+        One without a place is given at each vehicle's own.
         """
         payload = self._in_order(payload)
         answers = {}
@@ -304,10 +304,11 @@ class Lockstep:
             order = json.loads(payload)
         except (ValueError, RecursionError):
             return payload
-        if not isinstance(order, dict) or "revision" in order:
+        if not isinstance(order, dict) or "after" in order:
             return payload
         self._orders += 1
-        return json.dumps({**order, "revision": self._orders, "issuer": "lockstep"}).encode()
+        after = {i: [v.agent.orders.place(v.agent.flight.begun)] for i, v in self.vehicles.items()}
+        return json.dumps({"issuer": "lockstep", **order, "id": f"{self._orders}", "after": after}).encode()
 
     def stall(self, i: int, seconds: float) -> None:
         """Keep a companion's loop from running for a while; what arrives meanwhile waits in its agent."""

@@ -27,6 +27,7 @@ from companion.config import FleetConfig, Vehicle, autopilot_port, companion_por
 from companion.core.frames import Geodetic, Ned, geodetic_to_ned, ned_to_geodetic
 from companion.errors import CompanionError, ConfigError
 from companion.io.link import SO_TIMESTAMPNS, received_unix_ns
+from companion.preflight import same_setting
 from companion.wire.mavlink import dialect as mavlink
 from companion.wire.mavlink import interval_parameters, parameter_value
 from sim.stubs import TRUTH_DTYPE
@@ -52,13 +53,15 @@ SIH_QUADROTOR = 10040
 FLEET_PARAMETERS: Mapping[str, float | int] = {
     "COM_OBL_RC_ACT": 4,
     "COM_RC_OVERRIDE": 3,
+    "MAN_OVERRIDE_SPD": 1.0,
     "COM_RC_IN_MODE": 4,
     "NAV_RCL_ACT": 0,
     "NAV_DLL_ACT": 0,
     "COM_RCL_EXCEPT": 4,
     "SDLOG_MODE": -1,
 }
-"""a fleet without RC: land when the setpoints end; no stick input; no log on disk"""
+"""a fleet without RC: land when the setpoints end; no stick input; no log on disk. Of `preflight.ALTERNATIVES` a
+version has one"""
 SIMULATOR_PARAMETERS: Mapping[str, float | int] = {"EKF2_ACC_NOISE": 0.6, "EKF2_GYR_NOISE": 0.1}
 """what SIH's sensors are like: in flight their white noise is 0.5, 1.7 and 1.4 m/s^2 and 0.14, 0.07 and 0.03 rad/s a
 sample, of which the estimator's defaults (0.35 and 0.015) know nothing, so that it wanders by half a metre (see
@@ -77,6 +80,8 @@ class SitlSettings:
     stop_fd: int
     parameters: Mapping[str, float | int]
     """beyond FLEET_PARAMETERS and SIMULATOR_PARAMETERS, or instead of one of them"""
+    ready_path: Path | None = None
+    """a file that is made once every parameter was read back as set"""
     log: Callable[[str], None] = print
 
 
@@ -216,6 +221,8 @@ class _Instance:
         self.custom_mode = 0
         self.landed_state = 1
         self.checked: dict[str, float | int] = {}
+        self.demanded = frozenset(settings.parameters)
+        """what the user has set: to be read back under that very name"""
         self.clock: list[tuple[float, float]] = []
         """(UTC s, the simulation's s), first and latest"""
         self.mode_streamed = False
@@ -276,6 +283,8 @@ class SitlHost:
         with self._stack:
             if not self._read_back_parameters(ended):
                 return
+            if self.settings.ready_path is not None:
+                self.settings.ready_path.touch()
             for instance in self.instances:
                 if instance.index >= PX4_PORTS:
                     instance.px4.open_offboard_link()
@@ -406,8 +415,18 @@ def _missing(instance: _Instance) -> dict[str, float | int | None]:
     return {
         name: instance.checked.get(name)
         for name, value in instance.parameters.items()
-        if name not in instance.checked or abs(instance.checked[name] - value) > 1e-6
+        if not _as_set(instance, name, value) and (name in instance.demanded or not _other_name_set(instance, name))
     }
+
+
+def _as_set(instance: _Instance, name: str, value: float | int) -> bool:
+    return name in instance.checked and abs(instance.checked[name] - value) <= 1e-6
+
+
+def _other_name_set(instance: _Instance, name: str) -> bool:
+    """Whether another version's name of the same setting was read back as set."""
+    others = (n for n in same_setting(name) if n != name and n in instance.parameters)
+    return name not in instance.checked and any(_as_set(instance, n, instance.parameters[n]) for n in others)
 
 
 __all__ = ["FLEET_PARAMETERS", "Px4Instance", "SitlHost", "SitlSettings", "check_build"]

@@ -8,16 +8,18 @@ from companion.config import FleetConfig, Vehicle, autopilot_port, companion_por
 from companion.core.frames import Ned
 from companion.errors import ConfigError
 from sim.dynamics import DynamicsParameters, GustParameters, NoiseParameters
+from sim.px4.parameters import defaults
 from sim.stubs import StubFleetSettings, StubVehicleSettings
 
 LAND_ON_LOSS = 4
 FLEET_PARAMETERS: tuple[tuple[str, float | int], ...] = (
     ("COM_OBL_RC_ACT", LAND_ON_LOSS),
     ("COM_RC_OVERRIDE", 3),
+    ("MAN_OVERRIDE_SPD", 1.0),
     ("NAV_RCL_ACT", 0),
     ("COM_RCL_EXCEPT", 4),
 )
-"""PX4 parameters of a fleet without RC: land when the setpoints end; OFFBOARD needs no RC"""
+"""PX4 parameters of a fleet without RC, where a version has them: land when the setpoints end; OFFBOARD needs no RC"""
 
 
 def _ports(vehicle: Vehicle) -> tuple[int, int]:
@@ -56,6 +58,7 @@ def stub_settings(
     """Settings of the stubs; each estimator's origin lies elsewhere, by up to `stub.origin_scatter_m`, after `seed`."""
     stub = config.stub
     random = Random(f"origins/{seed}")
+    known = defaults(stub.px4_version)
     vehicles = []
     for k, v in enumerate(config.vehicles):
         way, angle = stub.origin_scatter_m * random.random(), 2.0 * pi * random.random()
@@ -74,7 +77,8 @@ def stub_settings(
                 ),
                 yaw_rad=radians(config.formation.heading_deg),
                 booted_before_ns=round(k / len(config.vehicles) * 1e9 / config.limits.control_rate_hz),
-                parameters=FLEET_PARAMETERS,
+                parameters=tuple((name, value) for name, value in FLEET_PARAMETERS if name in known),
+                px4_version=stub.px4_version,
             )
         )  # fmt: skip
     return StubFleetSettings(

@@ -80,6 +80,8 @@ class StubVehicleSettings:
     """how much earlier than its host it booted: autopilots' streams are not in step with each other"""
     parameters: tuple[tuple[str, float | int], ...] = ()
     """PX4 parameters that differ from the default"""
+    px4_version: str = "1.16"
+    """whose parameters it has"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,6 +227,7 @@ def build_autopilot(
         gust=settings.gust,
         noise=settings.noise,
         parameters=dict(vehicle.parameters),
+        px4_version=vehicle.px4_version,
         yaw_rad=vehicle.yaw_rad,
         seed=settings.seed,
     )

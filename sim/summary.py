@@ -161,7 +161,7 @@ class Flight:
         return None
 
     def _command(self, time_ns: int, vehicle_id: int, payload: bytes) -> Command | None:
-        order = read_order(payload)
+        order = read_order(payload, vehicle_id)
         if isinstance(order, Refusal):
             self.commands_unread += 1
             return None
@@ -261,7 +261,7 @@ def summarise(flight: Flight) -> dict[str, Any]:
     driven = every[every[:, 2] >= 0.0] if len(every) else every
     ended = truth.down if known else {i: flight.disarmed.get(i, False) for i in ids}
     gap = truth.gap_max_s if truth.gap_max_s is not None else _sent_gap_max_s(flight)
-    commands = sorted(flight.commands.values(), key=lambda c: (c.time_ns, c.order.rank))
+    commands = sorted(flight.commands.values(), key=lambda c: (c.time_ns, c.order.id))
     summary: dict[str, Any] = {
         "vehicles": len(ids),
         "judged_by": "truth" if known else "the vehicles' own estimates",
@@ -312,7 +312,7 @@ def _told(command: Command, takeoff_ns: int) -> dict[str, Any]:
     return {
         "at_s": _round((command.time_ns - takeoff_ns) * 1e-9),
         "verb": order.verb,
-        "revision": order.revision,
+        "id": order.id,
         "issuer": order.issuer,
         "accepted": sorted(command.accepted),
         "refused": dict(sorted(command.refused.items())),

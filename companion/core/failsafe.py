@@ -89,6 +89,8 @@ TAKE_OFF_S = 10.0
 MODE_S = 0.1
 DAMAGE_M = 0.5
 DAMAGE_M_S = 0.5
+CREEP_LIMIT_M = 1.0
+"""an estimator's origin that has moved so far, each time by less than DAMAGE_M, belongs to an estimate nobody knows"""
 LISTEN_S = 3.0
 """a vehicle that is apart listens this long before it comes back"""
 SUSPECT_S = 5.0
@@ -120,7 +122,8 @@ FAILSAFES: dict[Failsafe, Row] = {
     ),
     Failsafe.POSITION_JUMPS: Row("10 s of jumps", JUMPS_S, Action.LAND, "", _NOT),
     Failsafe.COVARIANCE: Row(
-        "2 s of ESTIMATOR_STATUS with flags missing, an accuracy worse than 3 m, or none for 5 s", UNCERTAIN_S,
+        "2 s of ESTIMATOR_STATUS with flags missing, an accuracy worse than 3 m or not above 0, or none for 5 s; "
+        "at once when the origin has crept 1 m, by less than 0.5 m each time", UNCERTAIN_S,
         Action.LAND, "the estimate may drift towards the others", _NOT,
     ),
     Failsafe.HEARTBEAT: Row("3 s", HEARTBEAT_S, Action.HAND_OVER, "released", _BY_COMMAND),
@@ -131,7 +134,10 @@ FAILSAFES: dict[Failsafe, Row] = {
     Failsafe.AUTOPILOT: Row(
         "the next CURRENT_MODE (20 Hz) or HEARTBEAT", MODE_S, Action.HAND_OVER, "the same", _BY_COMMAND,
     ),
-    Failsafe.NOT_ARMED: Row("10 s", TAKE_OFF_S, Action.CONTINUE, "the take-off is given up, on the ground", "take-off"),
+    Failsafe.NOT_ARMED: Row(
+        "10 s; at once where a heartbeat after the arming says disarmed: the pilot's word", TAKE_OFF_S, Action.CONTINUE,
+        "the take-off is given up, on the ground", "take-off",
+    ),
     Failsafe.NO_TAKE_OFF: Row("10 s armed", TAKE_OFF_S, Action.LAND, "", _NOT),
     Failsafe.ALTITUDE: Row("60 s of climb", CLIMB_S, Action.LAND, "", _NOT),
     Failsafe.MISSING: Row(

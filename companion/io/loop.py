@@ -299,6 +299,7 @@ class Companion:
         status = self.agent.status(now)
         counters = self.network.counters
         status["lateness_ms"] = self.lateness_ns * 1e-6
+        status["own_id_heard"] = self._hears_own_id(now.monotonic_ns)
         status["dropped"] = counters.dropped
         status["recorder_lost"] = 0 if self.recorder is None else self.recorder.lost
         elsewhere = {
@@ -316,15 +317,20 @@ class Companion:
             answered_ns = self.clock.now().fleet_ns
             reading = ClockReading(boot_id=self.boot_id, received_ns=received_ns, answered_ns=answered_ns)
             return reading.model_dump_json().encode()
-        heard = self._own_id_ns is not None and now.monotonic_ns - self._own_id_ns < self._own_id_memory_ns
+        heard = self._hears_own_id(now.monotonic_ns)
         return self.agent.account(now, own_id_heard=heard).model_dump_json().encode()
+
+    def _hears_own_id(self, now_ns: int) -> bool:
+        """Whether somebody else has spoken under this vehicle's id of late."""
+        heard = self.network.counters.own_id_heard
+        if heard > self._own_id_heard:
+            self._own_id_heard, self._own_id_ns = heard, now_ns
+        return self._own_id_ns is not None and now_ns - self._own_id_ns < self._own_id_memory_ns
 
     def _each_second(self, now_ns: int) -> None:
         self._second_ns = now_ns + 1_000_000_000
         self.clock.discipline(latched=self.agent.autopilot.armed)
-        own_id_heard = self.network.counters.own_id_heard
-        if own_id_heard > self._own_id_heard:
-            self._own_id_heard, self._own_id_ns = own_id_heard, now_ns
+        self._hears_own_id(now_ns)
         if self.recorder is not None and self.recorder.failure is not None:
             self._notice(Failsafe.DISK_FULL, now_ns)
         if now_ns >= self._file_due_ns:

@@ -27,6 +27,7 @@ import threading
 import time
 import zlib
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from queue import Empty, SimpleQueue
 from types import TracebackType
@@ -76,6 +77,9 @@ ASK_INTERVAL_S: Final = 0.03
 """an operator asks the same kind of question no more often, so that none of its own is left out"""
 MESSAGE_MAX_BYTES: Final = 1 << 20
 """what a session reassembles from fragments at most"""
+
+ANSWERS_MAX: Final = 8
+"""answers to one question: more than one is a fault already"""
 
 _SCOUTING_ADDRESS: Final = "224.0.0.224"
 _SCOUTING_PORTS: Final = range(20_000, 24_000)
@@ -584,38 +588,49 @@ class OperatorLink:
 
     def ask(
         self, vehicle_ids: Iterable[int], kind: str, payload: bytes, timeout_s: float, retry_s: float
-    ) -> dict[int, bytes | None]:
-        """Ask these vehicles at once; silent ones again every `retry_s` until `timeout_s`. None: never answered.
+    ) -> dict[int, tuple[bytes, ...]]:
+        """Ask these vehicles at once; silent ones again every `retry_s` until `timeout_s`. (): never answered.
 
-        A vehicle may see a question more than once, so a command has to carry an id of its own.
+        More than one answer: several companions answer under one id. A vehicle may see a question more than once, so a
+        command has to carry an id of its own.
         """
-        answers = self.ask_timed(vehicle_ids, kind, payload, timeout_s, retry_s)
-        return {i: None if answer is None else answer[0] for i, answer in answers.items()}
+        answers = self._ask(vehicle_ids, kind, payload, timeout_s, retry_s)
+        return {i: tuple(payload for payload, _, _ in found) for i, found in answers.items()}
 
     def ask_timed(
         self, vehicle_ids: Iterable[int], kind: str, payload: bytes, timeout_s: float, retry_s: float
     ) -> dict[int, tuple[bytes, int, int] | None]:
-        """The same, with when each was first asked and when it answered (this machine's UTC, ns)."""
+        """Each one's first answer, with when it was first asked and when it answered (this machine's UTC, ns)."""
+        answers = self._ask(vehicle_ids, kind, payload, timeout_s, retry_s)
+        return {i: found[0] if found else None for i, found in answers.items()}
+
+    def _ask(
+        self, vehicle_ids: Iterable[int], kind: str, payload: bytes, timeout_s: float, retry_s: float
+    ) -> dict[int, list[tuple[bytes, int, int]]]:
+        """By vehicle, all answers to the first of its questions that everybody who heard it has answered."""
         if not retry_s > 0:
             raise ValueError(f"retry_s must be > 0 s, got {retry_s}")
         session = self._opened()
-        answers: dict[int, tuple[bytes, int, int] | None] = dict.fromkeys(vehicle_ids)
-        silent = set(answers)
-        asked_ns: dict[int, int] = {}
-        inbox: SimpleQueue[tuple[int, bytes, int]] = SimpleQueue()
+        questions: dict[int, list[_Question]] = {i: [] for i in vehicle_ids}
+        answered: dict[int, _Question] = {}
+        inbox: SimpleQueue[_Question] = SimpleQueue()
         cancellation = zenoh.CancellationToken()
         now_s = self._wait_turn(kind)
         deadline_s = now_s + timeout_s
         next_round_s = now_s
         try:
-            while silent and now_s < deadline_s:
+            while len(answered) < len(questions) and now_s < deadline_s:
                 if now_s >= next_round_s:
                     self._asked_s[kind] = now_s
-                    for vehicle_id in sorted(silent):
-                        asked_ns.setdefault(vehicle_id, time.time_ns())
+                    for vehicle_id in sorted(questions.keys() - answered.keys()):
+                        question = _Question(vehicle_id, inbox)
+                        questions[vehicle_id].append(question)
                         session.get(
                             f"fleet/{vehicle_id}/{kind}",
-                            Callback(_collector(vehicle_id, inbox), indirect=False),
+                            Callback(question.take, question.ended, indirect=False),
+                            # Everybody who answers under this id, and all that they say: not the nearest one alone.
+                            target=zenoh.QueryTarget.ALL,
+                            consolidation=zenoh.ConsolidationMode.NONE,
                             payload=payload,
                             timeout=deadline_s - now_s,
                             congestion_control=zenoh.CongestionControl.DROP,
@@ -624,20 +639,21 @@ class OperatorLink:
                             cancellation_token=cancellation,
                         )
                     next_round_s = now_s + retry_s
-                try:
-                    vehicle_id, answer, answered_ns = inbox.get(timeout=max(0.0, min(next_round_s, deadline_s) - now_s))
-                except Empty:
-                    pass
-                else:
-                    if vehicle_id in silent:
-                        answers[vehicle_id] = answer, asked_ns[vehicle_id], answered_ns
-                        silent.discard(vehicle_id)
+                with suppress(Empty):
+                    question = inbox.get(timeout=max(0.0, min(next_round_s, deadline_s) - now_s))
+                    if question.answers:
+                        answered.setdefault(question.vehicle_id, question)
                 now_s = time.monotonic()
         except zenoh.ZError as error:
             raise PeerNetworkError(f"fleet {self._settings.fleet_name!r}: {error}") from error
         finally:
             cancellation.cancel()  # type: ignore[no-untyped-call]
-        return answers
+        found: dict[int, list[tuple[bytes, int, int]]] = {}
+        for i, asked in questions.items():
+            # Where somebody who heard it never answers, what the others said by now counts.
+            best = answered.get(i) or next((q for q in asked if q.answers), None)
+            found[i] = [] if best is None else [(a, asked[0].asked_ns, ns) for a, ns in tuple(best.answers)]
+        return found
 
     def _wait_turn(self, kind: str) -> float:
         """Let ASK_INTERVAL_S pass since the last question of a kind; returns the time then (monotonic, s)."""
@@ -652,12 +668,24 @@ class OperatorLink:
         return self._session
 
 
-def _collector(vehicle_id: int, inbox: SimpleQueue[tuple[int, bytes, int]]) -> Callable[[zenoh.Reply], None]:
-    def on_reply(reply: zenoh.Reply) -> None:
-        if (sample := reply.ok) is not None:
-            inbox.put((vehicle_id, sample.payload.to_bytes(), time.time_ns()))
+class _Question:
+    """One question on its way to everybody who answers under an id, with the answers so far."""
 
-    return on_reply
+    def __init__(self, vehicle_id: int, inbox: SimpleQueue[_Question]) -> None:
+        self.vehicle_id = vehicle_id
+        self.asked_ns = time.time_ns()
+        self.answers: list[tuple[bytes, int]] = []
+        """each with its time of arrival (UTC, ns)"""
+        self._inbox = inbox
+
+    def take(self, reply: zenoh.Reply) -> None:
+        """Called by Zenoh with each answer."""
+        if (sample := reply.ok) is not None and len(self.answers) < ANSWERS_MAX:
+            self.answers.append((sample.payload.to_bytes(), time.time_ns()))
+
+    def ended(self) -> None:
+        """Called by Zenoh once no further answer follows."""
+        self._inbox.put(self)
 
 
 def _received(event: Event) -> int:

@@ -109,6 +109,7 @@ class EstimatorHealth:
 
     flags: int
     horizontal_accuracy_m: float
+    """infinite where none is told"""
     vertical_accuracy_m: float
 
 
@@ -376,6 +377,10 @@ class MavlinkLink:
                     message.time_boot_ms, message.x, message.y, message.z, message.vx, message.vy, message.vz
                 )
             case mavlink.MAVLink_heartbeat_message():
+                if message.autopilot == mavlink.MAV_AUTOPILOT_INVALID:
+                    # A camera or a ground station with the autopilot's ids: it would disarm the vehicle in our eyes.
+                    self.rejected["heartbeat of no autopilot"] += 1
+                    return None
                 return Heartbeat(
                     message.autopilot, message.type, bool(message.base_mode & 128), message.custom_mode,
                     message.system_status,
@@ -385,7 +390,8 @@ class MavlinkLink:
             case mavlink.MAVLink_extended_sys_state_message():
                 return LandedState(message.landed_state)
             case mavlink.MAVLink_gps_global_origin_message():
-                if abs(message.latitude) > 900_000_000 or abs(message.longitude) > 1_800_000_000:
+                unset = message.latitude == 0 and message.longitude == 0
+                if unset or abs(message.latitude) > 900_000_000 or abs(message.longitude) > 1_800_000_000:
                     self.rejected["out of range"] += 1
                     return None
                 return GlobalOrigin(
@@ -393,9 +399,11 @@ class MavlinkLink:
                 )
             case mavlink.MAVLink_estimator_status_message():
                 accuracy = (message.pos_horiz_accuracy, message.pos_vert_accuracy)
-                return EstimatorHealth(message.flags, *(x if isfinite(x) else inf for x in accuracy))
+                # No estimate is exact: what is not above 0 was never filled in.
+                return EstimatorHealth(message.flags, *(x if 0.0 < x < inf else inf for x in accuracy))
             case mavlink.MAVLink_sys_status_message():
-                return SystemHealth(message.onboard_control_sensors_health, message.battery_remaining)
+                charge = message.battery_remaining if 0 <= message.battery_remaining <= 100 else -1
+                return SystemHealth(message.onboard_control_sensors_health, charge)
             case mavlink.MAVLink_command_ack_message():
                 if message.target_component not in (0, COMPANION_COMPONENT_ID):
                     return None

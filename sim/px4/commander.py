@@ -200,9 +200,15 @@ class Commander:
             self._killed_at_ns = now_ns
 
     def move_sticks(self, now_ns: int) -> None:
-        """A pilot moves the sticks: takes over automatic modes (COM_RC_OVERRIDE bit 0) and offboard (bit 1)."""
+        """A pilot moves the sticks: takes over automatic modes (COM_RC_OVERRIDE bit 0) and offboard (bit 1).
+
+        Since v1.18 both with MAN_OVERRIDE_SPD from 0 on.
+        """
         self.pilot_present = True
-        override = self._parameters.integer("COM_RC_OVERRIDE")
+        if "MAN_OVERRIDE_SPD" in self._parameters:
+            override = 3 if self._parameters.number("MAN_OVERRIDE_SPD") >= 0.0 else 0
+        else:
+            override = self._parameters.integer("COM_RC_OVERRIDE")
         if (self.mode.is_auto and override & 1) or (self.mode is Mode.OFFBOARD and override & 2):
             self.choose(Mode.POSCTL, now_ns)
 

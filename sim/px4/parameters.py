@@ -43,7 +43,9 @@ DEFAULTS: dict[str, float | int] = {
     "COM_RC_LOSS_T": 0.5,
     "COM_RC_OVERRIDE": 1,
     "COM_SPOOLUP_TIME": 1.0,
+    "EKF2_ACC_NOISE": 0.35,
     "EKF2_EN": 1,
+    "EKF2_GYR_NOISE": 0.015,
     "GF_ACTION": 2,
     "GF_MAX_HOR_DIST": 0.0,
     "GF_MAX_VER_DIST": 0.0,
@@ -89,7 +91,20 @@ DEFAULTS: dict[str, float | int] = {
     "SYS_HAS_GPS": 1,
     "SYS_HAS_MAG": 1,
 }
-"""name to default; an int is INT32, a float is FLOAT"""
+"""name to default in v1.16; an int is INT32, a float is FLOAT"""
+CHANGES: dict[str, dict[str, float | int | None]] = {
+    "1.16": {},
+    "1.18": {"COM_RC_OVERRIDE": None, "MAN_OVERRIDE_SPD": 1.0},
+}
+"""version to what differs from v1.16; None: gone"""
+
+
+def defaults(version: str) -> dict[str, float | int]:
+    """The parameters of a version."""
+    if version not in CHANGES:
+        raise ValueError(f"PX4 version must be one of {', '.join(CHANGES)}, got {version!r}")
+    values = {**DEFAULTS, **CHANGES[version]}
+    return {name: value for name, value in values.items() if value is not None}
 
 
 def _as_float32(value: float) -> float:
@@ -99,12 +114,13 @@ def _as_float32(value: float) -> float:
 class ParameterTable:
     """The parameters of one vehicle, sorted by name; indices are positions in that order."""
 
-    def __init__(self, overrides: Mapping[str, float | int]) -> None:
-        self._values = {name: _as_float32(v) if isinstance(v, float) else v for name, v in DEFAULTS.items()}
+    def __init__(self, overrides: Mapping[str, float | int], version: str = "1.16") -> None:
+        own = defaults(version)
+        self._values = {name: _as_float32(v) if isinstance(v, float) else v for name, v in own.items()}
         for name, value in overrides.items():
             if name not in self._values:
                 raise ValueError(f"PX4 parameter {name!r} is not known to the stub, got {value!r}")
-            is_float = isinstance(DEFAULTS[name], float)
+            is_float = isinstance(own[name], float)
             if not is_float and not isinstance(value, int):
                 raise ValueError(f"PX4 parameter {name} is an INT32, got {value!r}")
             self._values[name] = _as_float32(float(value)) if is_float else value

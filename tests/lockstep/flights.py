@@ -202,11 +202,11 @@ class InLockstep:
 
     def ask(
         self, vehicle_ids: Iterable[int], kind: str, payload: bytes, timeout_s: float, retry_s: float
-    ) -> dict[int, bytes | None]:
+    ) -> dict[int, tuple[bytes, ...]]:
         if kind == "command":
             answers = self.ls.command(payload, *vehicle_ids)
         else:
             answers = {
                 i: json.dumps(v.agent.status(self.ls.now)).encode() for i, v in self.ls.vehicles.items() if v.alive
             }
-        return {i: answers.get(i) for i in vehicle_ids}
+        return {i: (answers[i],) if i in answers else () for i in vehicle_ids}

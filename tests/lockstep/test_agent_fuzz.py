@@ -1,5 +1,6 @@
 """Whatever comes in, an agent does not fall over, and what it sends is finite and within its limits."""
 
+import itertools
 import json
 import random
 import struct
@@ -27,9 +28,13 @@ CONFIG = fleet(3)
 WORLD: Any = dialect.MAVLink(None, srcSystem=1, srcComponent=1)
 
 
-def ordered(revision: int, motion: bytes) -> bytes:
-    """A command to fly a motion."""
-    return b'{"verb":"motion","revision":%d,"issuer":"x","motion":%s}' % (revision, motion)
+IDS = itertools.count()
+
+
+def ordered(agent: Agent, motion: bytes) -> bytes:
+    """A command to fly a motion, given at a vehicle's place."""
+    head = {"id": f"{next(IDS)}", "issuer": "x", "after": {agent.id: [agent.orders.place(agent.flight.begun)]}}
+    return b'{"verb":"motion",%s,"motion":%s}' % (json.dumps(head)[1:-1].encode(), motion)
 
 
 class Noise:
@@ -175,7 +180,7 @@ class Noise:
                     [b"", b"null", b"{}", b"[" * 5000, b'{"verb":{}}', b'{"verb":"motion"}', r.randbytes(20)]
                 )
                 if r.random() < 0.5:
-                    command = ordered(r.randrange(1, 4), self.motion(ls))
+                    command = ordered(agent, self.motion(ls))
                 answer = json.loads(agent.receive_command(command, now))
                 assert answer["accepted"] in (True, False)
 
@@ -250,10 +255,10 @@ def refused(noise: Noise, ls: Lockstep, i: int) -> None:
     ):  # fmt: skip
         plan = json.dumps({**newest, "revision": newest["revision"] + 1, **wrong}).encode()
         agent.receive_peer(f"fleet/{other}/plan", plan, now)
-        agent.receive_command(ordered(9, plan), now)
+        agent.receive_command(ordered(agent, plan), now)
     agent.receive_presence(77, True, now)
     agent.receive_presence(77, False, now)
-    for command in (b"", b"[]", b"[" * 5000, b"\xff", b'{"verb":"fly"}', b'{"verb":"motion"}', ordered(3, b"1")):
+    for command in (b"", b"[]", b"[" * 5000, b"\xff", b'{"verb":"fly"}', b'{"verb":"motion"}', ordered(agent, b"1")):
         answer = json.loads(agent.receive_command(command, now))
         assert answer["accepted"] is False
         assert answer["reason"]
@@ -284,7 +289,7 @@ def test_what_is_refused_is_counted_and_changes_not_one_bit_of_what_is_sent() ->
         "malformed", "not finite", "out of range", "foreign system", "state: length", "state: version",
         "state: not finite", "state: out of range", "from the future", "state: id is not the key's", "foreign id",
         "own id", "peer: unknown topic", "plan: motion", "command: malformed", "command: motion",
-        "command: unknown verb", "command: revision", "plan: not this fleet's vehicles",
+        "command: unknown verb", "command: id", "plan: not this fleet's vehicles",
     ):  # fmt: skip
         assert counted[kind] > 50, (kind, counted)
     assert OTHER not in counted

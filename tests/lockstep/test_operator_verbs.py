@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,9 +22,11 @@ from flights import (
     wait,
 )
 
+from companion.agent import Agent
 from companion.core.plan import VelocityLeg, with_legs
 from companion.core.values import ZERO, Instant, Phase
 from companion.operate import Operator, velocity_leg
+from companion.orders import Place
 from companion.wire.mavlink import Px4Mode
 from companion.wire.peer import encode_motion
 from sim.lockstep import Lockstep
@@ -48,8 +51,14 @@ def aloft(count: int, record: Any = None) -> tuple[Lockstep, Operator]:
     return ls, Operator(ls.config, InLockstep(ls))
 
 
-def order(verb: str, revision: int, issuer: str = "me", **more: object) -> bytes:
-    return json.dumps({"verb": verb, "revision": revision, "issuer": issuer, **more}).encode()
+def place(ls: Lockstep, i: int = 1) -> Place:
+    """Where a vehicle says to be in the order of its commands."""
+    return Place(*ls.vehicles[i].agent.status(ls.now)["place"])
+
+
+def order(verb: str, name: str, *after: Place, **more: object) -> bytes:
+    """A command to vehicle 1, given at these places."""
+    return json.dumps({"verb": verb, "id": name, "issuer": "me", "after": {1: after}, **more}).encode()
 
 
 def said(ls: Lockstep, payload: bytes, i: int = 1) -> dict[str, Any]:
@@ -75,26 +84,70 @@ def until_mode(ls: Lockstep, wanted: Px4Mode) -> None:
 
 def test_an_older_command_is_refused_with_the_reason_and_a_retry_is_answered_alike() -> None:
     ls, _ = aloft(1)
-    release = order("release", 5)
+    before = place(ls)
+    release = order("release", "a", before)
     first_answer = ls.command(release, 1)[1]
     assert json.loads(first_answer)["accepted"]
-    old = said(ls, order("land", 4, "you"))
-    assert not old["accepted"]
-    assert old["reason"] == "command 4 by you is not newer than 5 by me, the last that was obeyed"
-    assert not said(ls, order("land", 5, "m"))["accepted"], "of two with one revision the larger issuer wins"
+    assert place(ls) == before._replace(obeyed=before.obeyed + 1)
+    late = said(ls, order("resume", "b", before))
+    assert (late["accepted"], late["in_order"]) == (False, False)
+    assert late["reason"] == "release by me was obeyed in between"
+    assert Place(*late["place"]) == place(ls), "whoever is refused learns where the vehicle is"
     notes = len(ls.notes)
     wait(ls, 1.0)
     assert ls.command(release, 1)[1] == first_answer
     wait(ls, 1.0)
     assert len(ls.notes) <= notes + 1
-    assert said(ls, order("resume", 5, "you"))["accepted"]
-    assert ls.vehicles[1].agent.status(ls.now)["command"] == [5, "you"]
+    assert said(ls, order("resume", "c", place(ls)))["accepted"]
 
 
 def test_a_refused_command_takes_no_place_in_the_order() -> None:
     ls, _ = aloft(1)
-    assert not said(ls, order("kill", 9))["accepted"], "without its confirmation"
-    assert said(ls, order("land", 2))["accepted"]
+    before = place(ls)
+    assert not said(ls, order("kill", "a", before))["accepted"], "without its confirmation"
+    assert place(ls) == before
+    assert said(ls, order("land", "b", before))["accepted"]
+
+
+@pytest.mark.parametrize("verb", ["kill", "land", "release"])
+def test_what_ends_a_flight_is_obeyed_whatever_came_in_between(verb: str) -> None:
+    ls, operator = aloft(1)
+    seen = place(ls)
+    for shape in ("line", "v", "line"):
+        assert operator.form(shape, ls.now.fleet_ns).all_accepted
+        wait(ls, 0.1)
+    assert place(ls).obeyed == seen.obeyed + 3
+    assert not said(ls, order("takeoff", "t", seen))["in_order"]
+    assert said(ls, order(verb, "x", seen, confirm=True))["accepted"]
+
+
+@pytest.mark.parametrize("verb", ["kill", "land", "release"])
+def test_what_was_captured_in_one_flight_does_not_end_a_later_one(verb: str) -> None:
+    def hover(tables: dict[str, Any]) -> None:
+        tables["plan"].update(automatic=False, then="stay")
+
+    ls = launch(fleet(1, change=hover), seed=4)
+    until(ls, 20.0, lambda: ls.all_in(Phase.WAITING))
+    obeyed = order(verb, "obeyed", place(ls), confirm=True)
+    lost = order(verb, "never came", place(ls), confirm=True)
+    assert said(ls, obeyed)["accepted"]
+    if verb == "release":
+        assert said(ls, order("resume", "r", place(ls)))["accepted"]
+    else:
+        until(ls, 60.0, lambda: ls.all_in(Phase.LANDED))
+        wait(ls, 3.0)
+        assert said(ls, order("takeoff", "t", place(ls)))["accepted"]
+    until(ls, 60.0, lambda: ls.all_in(Phase.WAITING))
+    for payload in (obeyed, lost):
+        said(ls, payload)
+    wait(ls, 3.0)
+    assert ls.all_in(Phase.WAITING)
+    assert ls.vehicles[1].autopilot.truth().armed
+    ls.kill(1)
+    ls.restart(1)
+    wait(ls, 0.5)
+    answer = said(ls, order(verb, "before the restart", place(ls)._replace(boot_id=7), confirm=True))
+    assert answer["reason"].startswith("it is for another companion of this vehicle")
 
 
 class Unheard(InLockstep):
@@ -103,33 +156,33 @@ class Unheard(InLockstep):
     def __init__(self, ls: Lockstep, *lost: int) -> None:
         super().__init__(ls)
         self.lost = lost
-        self.stale: dict[int, bytes | None] | None = None
+        self.stale: dict[int, tuple[bytes, ...]] | None = None
         self.sent: list[bytes] = []
 
     def ask(
         self, vehicle_ids: Iterable[int], kind: str, payload: bytes, timeout_s: float, retry_s: float
-    ) -> dict[int, bytes | None]:
+    ) -> dict[int, tuple[bytes, ...]]:
         if kind == "command":
             self.sent.append(payload)
         answers = super().ask(vehicle_ids, kind, payload, timeout_s, retry_s)
         if kind == "status" and self.stale is not None:
             answers, self.stale = self.stale, None
-        return {i: None if kind == "status" and i in self.lost else a for i, a in answers.items()}
+        return {i: () if kind == "status" and i in self.lost else a for i, a in answers.items()}
 
 
-@pytest.mark.parametrize("verb", ["kill", "land", "release"])
-def test_what_ends_a_flight_gets_through_to_a_vehicle_whose_status_was_lost(verb: str) -> None:
+@pytest.mark.parametrize("verb", ["kill", "land", "release", "resume"])
+def test_a_command_gets_through_to_a_vehicle_whose_status_was_lost(verb: str) -> None:
     ls = Lockstep(fleet(2))
     ls.run_until(2.0)
-    assert said(ls, order("release", 7, "zoe"))["accepted"]
+    assert said(ls, order("release", "z", place(ls)))["accepted"]
     link = Unheard(ls, 1)
     answers = getattr(Operator(ls.config, link, "me"), verb)()
-    assert answers.all_accepted
-    assert answers.accepted == (1, 2)
-    assert ls.vehicles[1].agent.status(ls.now)["command"] == [8, "me"]
-    late = said(ls, link.sent[0])
-    assert not late["accepted"], "a duplicate that comes late is still an old command"
-    assert late["command"] == [8, "me"]
+    if verb == "resume":
+        assert set(answers.refused.values()) == {"it is not armed"}
+    else:
+        assert answers.accepted == (1, 2)
+        late = said(ls, link.sent[0])
+        assert not late["accepted"], "the first, which named no place, is refused whenever it comes"
 
 
 def test_of_two_operators_at_the_same_moment_the_one_who_ends_the_flight_gets_through() -> None:
@@ -140,6 +193,68 @@ def test_of_two_operators_at_the_same_moment_the_one_who_ends_the_flight_gets_th
     b.status()
     assert a.command("land").all_accepted
     assert b.command("kill", confirm=True).all_accepted
+
+
+def test_of_two_operators_at_the_same_moment_one_is_told_what_the_other_did() -> None:
+    ls, a = aloft(1)
+    b = Operator(ls.config, InLockstep(ls), "b")
+    a.status()
+    b.status()
+    assert a.command("release").all_accepted
+    answers = b.command("resume")
+    assert answers.refused == {1: f"release by {a.issuer} was obeyed in between"}
+    assert answers.outdated == (1,)
+
+
+def test_a_vehicle_that_lies_about_its_place_hurts_nobody_but_itself() -> None:
+    ls, _ = aloft(3)
+
+    class Liar(InLockstep):
+        def ask(
+            self, vehicle_ids: Iterable[int], kind: str, payload: bytes, timeout_s: float, retry_s: float
+        ) -> dict[int, tuple[bytes, ...]]:
+            answers = super().ask(vehicle_ids, kind, payload, timeout_s, retry_s)
+            for i in (2,) if 2 in answers else ():
+                told = json.loads(answers[i][0])
+                answers[i] = (json.dumps({**told, "place": [2**62, 2**62, 10_001]}).encode(),)
+            return answers
+
+    answers = Operator(ls.config, Liar(ls)).land()
+    assert answers.accepted == (1, 3)
+    assert tuple(answers.refused) == (2,)
+    until(ls, 30.0, lambda: {ls.phases()[i] for i in (1, 3)} == {Phase.LANDED})
+
+
+def test_a_fleet_of_twenty_thousand_commands_and_motions_and_a_late_companion_obey_alike() -> None:
+    ls, operator = aloft(3)
+    for _ in range(20):
+        for i in ls.vehicles:
+            ls.command(b'{"verb":"resume"}', i)
+    newest = ls.vehicles[1].agent.programme.newest
+    for revision in (10_000, 20_000):
+        motion = with_legs(newest, at_ns=ls.now.fleet_ns, issuer=0, legs=(VelocityLeg(ZERO, 0.0),))
+        payload = json.dumps(
+            {"verb": "motion", "motion": json.loads(encode_motion(replace(motion, revision=revision)))}
+        )
+        assert all(json.loads(a)["accepted"] for a in ls.command(payload.encode()).values())
+        wait(ls, 1.0)
+    ls.kill(2)
+    wait(ls, 1.0)
+    ls.restart(2)
+    until(ls, 10.0, lambda: ls.vehicles[2].agent.programme.newest.revision == 20_000)
+    assert operator.move(velocity_leg(0.3, 0.0, 0.0), ls.now.fleet_ns).all_accepted
+    assert {v.agent.programme.newest.revision for v in ls.vehicles.values()} == {20_001}
+    assert operator.release().all_accepted
+
+
+def test_a_fresh_fleet_takes_no_motion_far_ahead_of_what_its_peers_tell() -> None:
+    ls = Lockstep(fleet(3, change=wait_for_orders))
+    ls.run_until(6.0)
+    newest = ls.vehicles[1].agent.programme.newest
+    motion = replace(with_legs(newest, at_ns=ls.now.fleet_ns, issuer=0, legs=()), revision=2**32 - 1)
+    payload = json.dumps({"verb": "motion", "motion": json.loads(encode_motion(motion))}).encode()
+    for answer in ls.command(payload).values():
+        assert json.loads(answer)["reason"] == "its revision 4294967295 is more than 10000 ahead of 0, the newest known"
 
 
 def test_a_hold_that_builds_on_an_old_motion_is_built_once_more_on_the_newest() -> None:
@@ -158,17 +273,28 @@ def test_a_hold_that_builds_on_an_old_motion_is_built_once_more_on_the_newest() 
 @pytest.mark.parametrize(
     ("payload", "why"),
     [
-        (b'{"verb":"land"}', "revision must be"), (order("land", 0), "revision must be"),
-        (b'{"verb":"land","revision":true,"issuer":"me"}', "revision must be"),
-        (b'{"verb":"land","revision":1}', "issuer must be"), (order("land", 1, "x" * 65), "issuer must be"),
-        (order("land", 100_000), "more than 10000 ahead"), (order("fly", 1), "unknown verb"),
+        (b'{"verb":"land"}', "id must be"), (order("land", ""), "id must be"), (order("land", "x" * 65), "id must be"),
+        (b'{"verb":"land","id":"a"}', "issuer must be"), (b'{"verb":"land","id":"a","issuer":7}', "issuer must be"),
+        (b'{"verb":"land","id":"a","issuer":"me"}', "after must be"), (order("fly", "a"), "unknown verb"),
+        (b'{"verb":"land","id":"a","issuer":"me","after":{"1":[[1,2]]}}', "after must be"),
+        (b'{"verb":"land","id":"a","issuer":"me","after":{"1":[[1,2,true]]}}', "after must be"),
+        (order("land", "a", *[Place(1, 1, 1)] * 9), "after must be"),
+        (order("land", "a"), "at which place"), (order("land", "a", Place(5, 0, 0)), "another companion"),
+        (order("land", "a", Place(9, 1, 0)), "another flight"), (order("kill", "a", Place(9, 0, 0)), "confirmation"),
     ],
 )  # fmt: skip
 def test_a_command_out_of_all_order_is_refused(payload: bytes, why: str) -> None:
-    agent = Lockstep(fleet(1)).vehicles[1].agent
+    agent = Agent(fleet(1), 1, boot_id=9)
     answer = json.loads(agent.receive_command(payload, Instant(1, 1)))
     assert not answer["accepted"]
     assert why in answer["reason"]
+    assert answer["place"] == [9, 0, 0]
+
+
+def test_of_the_places_given_one_must_be_this_companions() -> None:
+    agent = Agent(fleet(1), 1, boot_id=9)
+    both = order("release", "a", Place(5, 3, 8), Place(9, 0, 0))
+    assert json.loads(agent.receive_command(both, Instant(1, 1)))["accepted"]
 
 
 def test_no_motion_may_use_up_the_revisions_of_all_others() -> None:
@@ -177,20 +303,20 @@ def test_no_motion_may_use_up_the_revisions_of_all_others() -> None:
     legs = (VelocityLeg(ZERO, 0.0),)
     motion = with_legs(newest, at_ns=ls.now.fleet_ns, issuer=0, legs=legs)
     tree = json.loads(encode_motion(motion))
-    answer = said(ls, order("motion", 1, motion={**tree, "revision": 2**32 - 1}))
+    answer = said(ls, order("motion", "a", place(ls), motion={**tree, "revision": 2**32 - 1}))
     assert "ahead" in answer["reason"]
-    assert said(ls, order("motion", 1, "you", motion=tree))["accepted"]
+    assert said(ls, order("motion", "b", place(ls), motion=tree))["accepted"]
 
 
 def test_a_motion_that_climbs_for_ever_or_begins_far_away_is_refused() -> None:
     ls, _ = aloft(1)
     newest = ls.vehicles[1].agent.programme.newest
     up = with_legs(newest, at_ns=ls.now.fleet_ns, issuer=0, legs=(velocity_leg(0.0, 0.0, 0.5),))
-    answer = said(ls, order("motion", 1, motion=json.loads(encode_motion(up))))
+    answer = said(ls, order("motion", "a", place(ls), motion=json.loads(encode_motion(up))))
     assert answer["reason"] == "it climbs or sinks for ever; give an altitude to go to"
     tree = json.loads(encode_motion(with_legs(newest, at_ns=ls.now.fleet_ns, issuer=0, legs=(VelocityLeg(ZERO, 0.0),))))
     tree["centre_ned_m"][0] += 150.0
-    assert "out of range" in said(ls, order("motion", 2, motion=tree))["reason"]
+    assert "out of range" in said(ls, order("motion", "b", place(ls), motion=tree))["reason"]
 
 
 # -- rtl -------------------------------------------------------------------------------------------------------------
@@ -361,12 +487,12 @@ def test_what_is_being_killed_is_not_resumed_and_a_kill_in_vain_does_not_fire_la
 def test_on_the_ground_there_is_nothing_to_resume() -> None:
     ls = Lockstep(fleet(1))
     ls.run_until(5.0)
-    assert said(ls, order("resume", 1))["reason"] == "it is not armed"
+    assert said(ls, order("resume", "a", place(ls)))["reason"] == "it is not armed"
 
 
 def test_a_killed_vehicle_falls_at_once_and_the_others_stay() -> None:
     ls, operator = aloft(2)
-    assert not said(ls, order("kill", 3))["accepted"]
+    assert not said(ls, order("kill", "a", place(ls)))["accepted"]
     assert operator.kill(1).all_accepted
     wait(ls, 0.2)
     assert not ls.vehicles[1].autopilot.truth().armed

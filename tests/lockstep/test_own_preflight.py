@@ -50,6 +50,23 @@ def test_a_vehicle_whose_autopilot_has_an_unfit_parameter_refuses_whoever_asks(
     assert take_off(ls, 1) is None
 
 
+def of_1_18(tables: dict[str, Any]) -> None:
+    tables["stub"]["px4_version"] = "1.18"
+
+
+def test_a_vehicle_on_px4_1_18_takes_off_and_its_sticks_must_end_offboard() -> None:
+    ls = Lockstep(fleet(1, change=of_1_18))
+    ls.run_until(6.0)
+    assert ls.vehicles[1].agent.unready(ls.now) == []
+    set_parameter(ls, 1, "MAN_OVERRIDE_SPD", -1.0)
+    ls.run_until(13.0)
+    assert take_off(ls, 1) == "MAN_OVERRIDE_SPD is -1, must be >= 0: a pilot's sticks would not end OFFBOARD"
+    set_parameter(ls, 1, "MAN_OVERRIDE_SPD", 1.0)
+    ls.run_until(20.0)
+    assert take_off(ls, 1) is None
+    until_formed(ls)
+
+
 def test_a_low_battery_and_a_slow_link_are_named_together() -> None:
     ls = Lockstep(fleet(1))
     ls.run_until(6.0)

@@ -265,7 +265,7 @@ def test_the_summary_has_every_operators_command_with_its_issuer_and_answers(flo
     for c in commands:
         assert (c["accepted"], c["refused"], c["unanswered"]) == (flown.fleet.ids, {}, [])
         assert c["issuer"].startswith("operator-")
-    assert [c["revision"] for c in commands] == [1, 2, 3, 4, 5]
+    assert len({c["id"] for c in commands}) == 5
     assert summary["commands_left_out"] == 5  # garbage that vehicle 1 got
     assert summary["killed"] == summary["unrecorded"] == summary["autopilots_lost"] == {}
 

@@ -12,6 +12,7 @@ from fleet_process import child, children, eventually, gone, run
 from px4_fleet import flying, sitl_fleet
 
 from companion.core.frames import Ned, ned_to_geodetic
+from companion.io.recorder import read_recording
 from companion.wire.mavlink import Px4Mode
 from sim.sitl import Px4Instance
 
@@ -152,6 +153,11 @@ def test_a_parameter_that_px4_does_not_have_ends_the_start_with_its_name(tmp_pat
         assert flight.up.wait(90.0) == 1
     assert "PX4 parameters not as set" in flight.up.err
     assert "NO_SUCH_THING" in flight.up.err
+    rows = flight.truth(1)
+    assert len(rows) > 0
+    assert not rows["armed"].any(), "nobody took off meanwhile"
+    channels = {e.channel for e in read_recording(flight.folder / "vehicle-1.mcap").entries}
+    assert "input/command" not in channels
 
 
 def test_external_autopilots_fly_and_are_judged_by_their_own_estimates(tmp_path: Path, build: Path) -> None:
@@ -161,7 +167,8 @@ def test_external_autopilots_fly_and_are_judged_by_their_own_estimates(tmp_path:
         for v in fleet.config.vehicles:
             home = ned_to_geodetic(Ned(v.pad_north_m, v.pad_east_m, 0.0), fleet.config.origin)
             parameters = {
-                "COM_OBL_RC_ACT": 4, "COM_RC_OVERRIDE": 3, "COM_RC_IN_MODE": 4, "COM_RCL_EXCEPT": 4, "SDLOG_MODE": -1,
+                "COM_OBL_RC_ACT": 4, "COM_RC_OVERRIDE": 3, "MAN_OVERRIDE_SPD": 1.0, "COM_RC_IN_MODE": 4,
+                "COM_RCL_EXCEPT": 4, "SDLOG_MODE": -1,
             }  # fmt: skip
             instances.append(Px4Instance(v.instance, home, build, tmp_path / f"px4-{v.id}", parameters))
         with flying(fleet, build, "--autopilot", "external") as flight:

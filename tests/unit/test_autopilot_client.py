@@ -165,6 +165,34 @@ def test_a_reboot_forgets_clock_and_origin_and_sets_the_streams_up_anew() -> Non
     assert one.client.state(at(110.2)) is not None
 
 
+LAST_MS = (1 << 32) - 1
+
+
+@pytest.mark.parametrize("gap_s", [0.02, 1.5, 30.0])
+def test_a_time_since_boot_that_goes_round_goes_on_and_a_reboot_after_it_is_noticed(gap_s: float) -> None:
+    one = ready(10.0)
+    clock = one.client.boot
+    clock.restart()
+    one.position(20.0, boot_ms=LAST_MS - 9)
+    assert one.position(20.0 + gap_s, 1.0, 2.0, 3.0, 0.0, 0.0, 0.0, boot_ms=round(gap_s * 1000) - 10)
+    assert one.client.counts["autopilot reboot"] == 0
+    state = one.client.state(at(20.0 + gap_s))
+    assert state is not None
+    assert one.position(20.1 + gap_s, boot_ms=round(gap_s * 1000) + 90)
+    assert not one.position(20.2 + gap_s, boot_ms=round(gap_s * 1000) + 90), "repeated"
+    one.position(80.0, boot_ms=60_000)
+    one.position(85.0, boot_ms=1_700)
+    assert one.client.counts["autopilot reboot"] == 1
+
+
+def test_a_reboot_days_before_the_time_would_go_round_is_noticed() -> None:
+    one = ready(10.0)
+    one.client.boot.restart()
+    one.position(20.0, boot_ms=LAST_MS - 86_400_000)
+    one.position(25.0, boot_ms=1_700)
+    assert one.client.counts["autopilot reboot"] == 1
+
+
 # -- requests ----------------------------------------------------------------------------------------------------------
 
 
@@ -438,11 +466,26 @@ def answered(one: Px4, start_s: float, end_s: float, silent: frozenset[str] = fr
     return asked
 
 
+OF_1_16 = tuple(name for name in PARAMETERS if name != "MAN_OVERRIDE_SPD")
+OF_1_18 = tuple(name for name in PARAMETERS if name != "COM_RC_OVERRIDE")
+
+
+def test_of_the_names_of_one_setting_the_one_that_answers_is_read_and_the_other_left_alone() -> None:
+    one = ready(10.0)
+    gone = frozenset({"COM_RC_OVERRIDE"})
+    first_round = answered(one, 10.0, 11.5, gone)
+    assert sum(name in gone for _, name in first_round) <= 2
+    facts = one.client.facts(at(11.5))
+    assert set(facts.parameters) == set(OF_1_18)
+    assert facts.missing == frozenset()
+    assert [name for _, name in answered(one, 11.5, 20.0, gone)] == list(OF_1_18)
+
+
 def test_all_parameters_are_read_within_a_second_a_few_at_a_time() -> None:
     one = ready(10.0)
     asked = answered(one, 10.0, 11.0)
-    assert [name for _, name in asked] == list(PARAMETERS)
-    assert set(one.client.facts(at(11.0)).parameters) == set(PARAMETERS)
+    assert [name for _, name in asked] == list(OF_1_16)
+    assert set(one.client.facts(at(11.0)).parameters) == set(OF_1_16)
     assert one.client.facts(at(11.0)).parameters["COM_OBL_RC_ACT"] == 4
     assert max(sum(t == now for t, _ in asked) for now, _ in asked) <= PARAMETERS_AT_ONCE
 
@@ -464,7 +507,7 @@ def test_a_parameter_that_never_comes_is_missing_and_the_others_are_read() -> No
     assert times == pytest.approx([times[0] + RETRY_S * k for k in range(PARAMETER_TRIES)], abs=0.011)
     facts = one.client.facts(at(14.5))
     assert facts.missing == {"GF_ACTION"}
-    assert set(facts.parameters) == set(PARAMETERS) - {"GF_ACTION"}
+    assert set(facts.parameters) == set(OF_1_16) - {"GF_ACTION"}
     tells(one, "GF_ACTION", 2, 14.6)
     assert one.client.facts(at(14.6)).missing == frozenset()
 
@@ -473,13 +516,13 @@ def test_parameters_are_read_anew_on_the_ground_and_left_alone_in_flight() -> No
     one = ready(10.0)
     answered(one, 10.0, 12.0)
     again = answered(one, 12.0, 20.0)
-    assert [name for _, name in again] == list(PARAMETERS)
+    assert [name for _, name in again] == list(OF_1_16)
     assert again[0][0] >= 10.0 + PARAMETER_PERIOD_NS * 1e-9
     one.heartbeat(20.0, armed=True)
     flown = [m.get_type() for k in range(1000) for m in one.hear(20.0 + 0.01 * k)]
     assert {"PARAM_REQUEST_READ", "TIMESYNC"}.isdisjoint(flown)
     one.heartbeat(30.0)
-    assert len(answered(one, 30.0, 31.0)) == len(PARAMETERS)
+    assert len(answered(one, 30.0, 31.0)) == len(OF_1_16)
 
 
 def test_a_reboot_forgets_the_parameters() -> None:

@@ -3,10 +3,12 @@
 import json
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
-from math import inf, pi, radians
+from math import inf, nan, pi, radians
 from pathlib import Path
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from companion.config import FleetConfig, load
 from companion.core.frames import Ned
@@ -35,6 +37,16 @@ def formed(config: FleetConfig = CONFIG) -> Motion:
     )  # fmt: skip
 
 
+def status(i: int, motion: Motion, /, **more: object) -> dict[str, object]:
+    """What a vehicle tells of itself."""
+    return {
+        "vehicle": i, "fleet": "starling", "up_s": 100.0 + i, "place": [100 + i, 1, 4], "phase": "formed",
+        "mode": "OFFBOARD", "armed": True, "ready": [], "unfit": [], "revision": motion.revision, "shape": motion.shape,
+        "motion": json.loads(encode_motion(motion)), "position_error_m": 0.1, "neighbours": 3, "nearest_m": 4.0,
+        "oldest_age_s": 1.0, "messages": 7, "battery_percent": 90, "failsafes": [], "rejected": {}, **more,
+    }  # fmt: skip
+
+
 @dataclass
 class Fleet:
     """Vehicles that hold given motions and answer as they are told to; a real Link without a network."""
@@ -42,7 +54,12 @@ class Fleet:
     motions: dict[int, Motion | None]
     """None: silent"""
     refusals: dict[int, str] = field(default_factory=dict)
-    obeyed: dict[int, list[object]] = field(default_factory=dict)
+    places: dict[int, list[int]] = field(default_factory=dict)
+    """vehicle id -> where it is in the order of its commands, if not where its status says"""
+    told: dict[int, dict[str, object]] = field(default_factory=dict)
+    """vehicle id -> what its status says otherwise"""
+    raw: dict[tuple[int, str], tuple[bytes, ...]] = field(default_factory=dict)
+    """vehicle id and kind of question -> the bytes that answer it"""
     came: list[tuple[int, str, bytes]] = field(default_factory=list)
     checks: dict[int, tuple[Check, ...]] = field(default_factory=dict)
     """vehicle id -> the rows of its own preflight"""
@@ -51,24 +68,29 @@ class Fleet:
 
     def ask(
         self, vehicle_ids: Iterable[int], kind: str, payload: bytes, timeout_s: float, retry_s: float
-    ) -> dict[int, bytes | None]:
+    ) -> dict[int, tuple[bytes, ...]]:
         assert 0 < retry_s < timeout_s
-        answers: dict[int, bytes | None] = {}
+        answers: dict[int, tuple[bytes, ...]] = {}
         for i in vehicle_ids:
             motion = self.motions[i]
             self.came.append((i, kind, payload))
-            if motion is None:
-                answers[i] = None
+            if (i, kind) in self.raw:
+                answers[i] = self.raw[i, kind]
+            elif motion is None:
+                answers[i] = ()
             elif kind == "preflight":
-                answers[i] = self.account(i)
+                answers[i] = (self.account(i),)
             elif kind == "status":
-                told = {"vehicle": i, "motion": json.loads(encode_motion(motion)), "command": self.obeyed.get(i)}
-                answers[i] = json.dumps(told).encode()
+                answers[i] = (json.dumps(status(i, motion, **self.told.get(i, {}))).encode(),)
             else:
-                reason = self.refusals.get(i)
-                told = {"vehicle": i, "accepted": reason is None, "reason": reason, "command": self.obeyed.get(i)}
-                answers[i] = json.dumps(told).encode()
+                answers[i] = (json.dumps(self.answer(i, payload)).encode(),)
         return answers
+
+    def answer(self, i: int, payload: bytes) -> dict[str, object]:
+        here = self.places.get(i, [100 + i, 1, 4])
+        in_order = here in json.loads(payload)["after"][str(i)]
+        reason = self.refusals.get(i) if in_order else "not in order"
+        return {"vehicle": i, "accepted": reason is None, "reason": reason, "in_order": in_order, "place": here}
 
     def ask_timed(
         self, vehicle_ids: Iterable[int], kind: str, payload: bytes, timeout_s: float, retry_s: float
@@ -249,15 +271,127 @@ def test_a_fleet_that_waits_for_its_operator_is_formed_by_him() -> None:
     assert link.motion().revision == 1
 
 
-def test_a_vehicle_whose_plan_cannot_be_read_is_named() -> None:
-    class Strange(Fleet):
-        def ask(
-            self, vehicle_ids: Iterable[int], kind: str, payload: bytes, timeout_s: float, retry_s: float
-        ) -> dict[int, bytes | None]:
-            return {i: json.dumps({"vehicle": i, "motion": {"version": 9}}).encode() for i in vehicle_ids}
+Act = Callable[[Operator], Answers]
+MOTIONS: list[Act] = [
+    lambda o: o.hold(lambda: NOW_NS), lambda o: o.rtl(NOW_NS), lambda o: o.form("line", NOW_NS),
+    lambda o: o.move(velocity_leg(1.0, 0.0, 0.0), NOW_NS), lambda o: o.goto(5.0, 5.0, None, 1.0, NOW_NS),
+]  # fmt: skip
 
-    with pytest.raises(RefusedError, match="vehicle 1 tells a plan that cannot be read"):
-        Operator(CONFIG, Strange({})).hold(lambda: NOW_NS)
+
+@pytest.mark.parametrize("act", MOTIONS)
+@pytest.mark.parametrize(
+    "answer",
+    [
+        b"", b"null", b"[]", b"{}", b"\xff", b"[" * 100_000, b'{"vehicle":2}', b"1" * 5000,
+        json.dumps({k: v for k, v in status(2, CONFIG.first_motion).items() if k != "motion"}).encode(),
+        json.dumps(status(2, CONFIG.first_motion, motion={"version": 9})).encode(),
+        json.dumps(status(2, CONFIG.first_motion, motion=None)).encode(),
+        json.dumps(status(2, CONFIG.first_motion, nearest_m=nan)).encode(),
+        json.dumps(status(2, CONFIG.first_motion)).encode().replace(b'"messages": 7', b'"messages": ' + b"9" * 5000),
+        json.dumps(status(3, CONFIG.first_motion)).encode(),
+        json.dumps(status(2, replace(formed(), revision=2**32 - 1))).encode(),
+        json.dumps(status(2, replace(formed(), revision=10_002))).encode(),
+        json.dumps(status(2, replace(formed(), revision=2, start_ns=2**62))).encode(),
+    ],
+)  # fmt: skip
+def test_one_vehicle_that_answers_nonsense_is_named_and_keeps_no_motion_from_the_others(
+    act: Act, answer: bytes
+) -> None:
+    link = fleet()
+    link.raw[2, "status"] = (answer,)
+    answers = act(Operator(CONFIG, link))
+    assert {1, 3, 4} <= set(answers.accepted)
+    assert "vehicle 2's" in answers.sentence("hold")
+    assert {json.loads(p)["motion"]["revision"] for p in link.commands()} == {2}
+
+
+def test_a_late_companion_is_no_measure_of_how_far_the_others_are() -> None:
+    link = fleet(replace(formed(), revision=20_000))
+    link.motions[1] = link.motions[4] = CONFIG.first_motion
+    assert Operator(CONFIG, link).hold(lambda: NOW_NS).all_accepted
+    assert link.motion().revision == 20_001
+
+
+def test_revisions_that_are_used_up_are_told() -> None:
+    with pytest.raises(RefusedError, match="used up"):
+        Operator(CONFIG, fleet(replace(formed(), revision=2**32 - 1))).hold(lambda: NOW_NS)
+
+
+@pytest.mark.parametrize("answer", [b"", b"{}", b'{"vehicle":' + b"9" * 5000 + b"}", b"\xff"])
+def test_a_preflight_answer_that_cannot_be_read_is_a_fault_of_that_vehicle(answer: bytes) -> None:
+    link = fleet()
+    link.raw[2, "preflight"] = (answer,)
+    faults = Operator(CONFIG, link).preflight().faults
+    assert len(faults) == 1
+    assert faults[0].startswith("vehicle 2: its answer cannot be read")
+
+
+@settings(deadline=None)
+@given(st.dictionaries(st.sampled_from(sorted(status(2, formed()))), st.none() | st.integers() | st.floats()
+       | st.text(max_size=5) | st.lists(st.integers(), max_size=3), max_size=4))  # fmt: skip
+def test_no_status_of_one_vehicle_keeps_a_landing_or_a_hold_from_the_others(wrong: dict[str, object]) -> None:
+    link = fleet()
+    link.told[2] = wrong
+    assert {1, 3, 4} <= set(Operator(CONFIG, link).land().accepted)
+    assert {1, 3, 4} <= set(Operator(CONFIG, link).hold(lambda: NOW_NS).accepted)
+
+
+# -- which flight ------------------------------------------------------------------------------------------------------
+
+
+def twice(link: Fleet, i: int) -> None:
+    """Two companions answer as this vehicle."""
+    one, two = (status(i, formed(), place=[boot, 1, 4], up_s=up) for boot, up in ((100 + i, 12.0), (7, 340.0)))
+    link.raw[i, "status"] = (json.dumps(one).encode(), json.dumps(two).encode())
+
+
+@pytest.mark.parametrize("act", [*MOTIONS, lambda o: o.land(), lambda o: o.kill(), lambda o: o.release(),
+                                 lambda o: o.resume(), lambda o: o.take_off()])  # fmt: skip
+def test_where_two_companions_answer_as_one_vehicle_nobody_is_commanded(act: Act) -> None:
+    link = fleet()
+    twice(link, 3)
+    with pytest.raises(RefusedError, match="vehicle 3 is two companions, one up for 12 s and one up for 340 s"):
+        act(Operator(CONFIG, link))
+    assert link.commands() == []
+
+
+def test_a_companion_that_hears_another_under_its_own_id_is_one_of_two() -> None:
+    link = fleet()
+    link.told[3] = {"own_id_heard": True}
+    with pytest.raises(RefusedError, match="vehicle 3 is two companions, one up for 103 s and one that it hears"):
+        Operator(CONFIG, link).land()
+
+
+def test_what_ends_a_flight_reaches_both_if_that_is_wanted() -> None:
+    link = fleet()
+    twice(link, 3)
+    operator = Operator(CONFIG, link, both=True)
+    assert operator.land().all_accepted
+    (order,) = {json.dumps(json.loads(p)["after"]["3"]) for p in link.commands()}
+    assert json.loads(order) == [[103, 1, 4], [7, 1, 4]]
+    with pytest.raises(RefusedError, match="two companions"):
+        operator.resume()
+    assert Operator(CONFIG, link).land(2).accepted == (2,), "the others are no trouble of vehicle 2's"
+
+
+def test_a_second_companion_that_shows_only_in_the_answers_is_told() -> None:
+    link = fleet()
+    here = json.dumps({"vehicle": 3, "accepted": True, "place": [103, 1, 4]}).encode()
+    other = {"vehicle": 3, "accepted": False, "reason": "it is for another companion", "in_order": False}
+    link.raw[3, "command"] = (here, json.dumps({**other, "place": [7, 1, 4]}).encode())
+    answers = Operator(CONFIG, link).resume()
+    assert answers.refused == {3: "two companions answer as this vehicle: it is for another companion"}
+
+
+def test_a_verb_tells_which_flight_it_reached() -> None:
+    link = fleet()
+    operator = Operator(CONFIG, link)
+    assert operator.reached == "fleet starling: nobody"
+    operator.land()
+    assert operator.reached == "fleet starling, companions up for 104 s"
+    link.told[2] = {"up_s": 3.0}
+    operator.land()
+    assert operator.reached == "fleet starling, companions up for 3 to 104 s"
 
 
 def test_a_climb_for_ever_is_not_sent() -> None:
@@ -267,31 +401,42 @@ def test_a_climb_for_ever_is_not_sent() -> None:
     assert link.commands() == []
 
 
-def test_a_command_is_newer_than_the_last_that_any_vehicle_obeyed_and_than_ones_own() -> None:
+def test_a_command_names_the_place_at_which_each_vehicle_said_to_be() -> None:
     link = fleet()
-    link.obeyed[3] = [41, "somebody"]
+    link.told[3] = {"place": [5, 6, 7]}
+    link.places[3] = [5, 6, 7]
     operator = Operator(CONFIG, link, issuer="me")
+    assert operator.land().all_accepted
+    order = json.loads(link.commands()[0])
+    assert order["after"] == {"1": [[101, 1, 4]], "2": [[102, 1, 4]], "3": [[5, 6, 7]], "4": [[104, 1, 4]]}
+    assert order["issuer"] == "me"
     operator.land()
-    operator.land()
-    orders = [json.loads(p) for p in link.commands()]
-    assert [(o["revision"], o["issuer"]) for o in orders] == [(42, "me")] * 4 + [(43, "me")] * 4
+    assert len({json.loads(p)["id"] for p in link.commands()}) == 2, "two commands alike are two"
 
 
-def test_only_what_ends_a_flight_is_commanded_again_above_a_newer_command() -> None:
+def test_only_what_ends_a_flight_is_commanded_again_to_whoever_has_gone_on_and_to_the_silent() -> None:
     link = fleet()
-    link.obeyed[3] = [41, "somebody"]
-    link.refusals[3] = "not newer"
+    operator = Operator(CONFIG, link, issuer="me")
+    operator.status()
+    link.places[3] = [103, 2, 9]
     link.refusals[2] = "it is on the ground"
     link.motions[4] = None
-    operator = Operator(CONFIG, link, issuer="me")
     assert operator.command("resume").outdated == (3,)
-    assert [json.loads(p)["revision"] for p in link.commands()] == [1] * 4
+    assert len(link.commands()) == 4
     link.came.clear()
     operator = Operator(CONFIG, link, issuer="me")
+    operator.status()
+    link.came.clear()
     answers = operator.command("kill", confirm=True)
-    again = [(i, json.loads(p)["revision"]) for i, _, p in link.came[4:]]
-    assert again == [(3, 42), (4, 42), (4, 43), (4, 44)], "whoever has a newer one, and the silent"
-    assert answers == Answers((1,), {2: "it is on the ground", 3: "not newer"}, (4,))
+    again = [i for i, _, _ in link.came]
+    assert again == [1, 2, 3, 4, 3, 4, 4, 4], "whoever was elsewhere, and the silent"
+    assert answers == Answers((1, 3), {2: "it is on the ground"}, (4,))
+
+
+def test_whoever_was_not_heard_before_a_command_is_commanded_once_more() -> None:
+    link = fleet()
+    assert Operator(CONFIG, link).command("resume").all_accepted
+    assert len(link.commands()) == 8
 
 
 def test_two_operators_are_two_issuers() -> None:

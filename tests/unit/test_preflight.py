@@ -55,7 +55,7 @@ def test_a_fit_vehicle_meets_every_row_and_each_row_names_it() -> None:
     assert unmet(rows) == []
     assert {c.vehicle for c in rows} == {3}
     assert len({c.name for c in rows}) == len(rows)
-    assert {c.name for c in rows} >= set(PARAMETERS)
+    assert {c.name for c in rows} >= set(PARAMETERS) - {"MAN_OVERRIDE_SPD"}
 
 
 LIMITS = [
@@ -154,6 +154,7 @@ PARAMETER_LIMITS: list[tuple[str, list[float], list[float]]] = [
     ("COM_OF_LOSS_T", [0.01, 0.5, 1.0], [-1.0, 0.0, 1.001, 5.0]),
     ("COM_OBL_RC_ACT", [4], [-1, 0, 1, 2, 3, 6, 7]),
     ("COM_RC_OVERRIDE", [2, 3], [0, 1]),
+    ("MAN_OVERRIDE_SPD", [0.0, 1.0, 10.0], [-1.0, -0.001]),
     ("NAV_RCL_ACT", [0, 1, 2, 3], [-1, 4, 5, 6]),
     ("COM_RCL_EXCEPT", [4, 5, 6, 7], [0, 1, 2, 3]),
     ("NAV_DLL_ACT", [0, 1, 2, 3], [-1, 4, 5, 6]),
@@ -246,3 +247,15 @@ def test_the_assignments_hash_follows_slots_and_vehicles() -> None:
     assert assignment_hash(CONFIG) == assignment_hash(config(battery_min_percent=50.0))
     wider = CONFIG.model_copy(update={"formation": CONFIG.formation.model_copy(update={"spacing_m": 5.0})})
     assert assignment_hash(wider) != assignment_hash(CONFIG)
+
+
+def test_the_name_under_which_this_px4_has_a_setting_is_enough_and_one_is_needed() -> None:
+    without = {name: v for name, v in FIT_PARAMETERS.items() if name != "COM_RC_OVERRIDE"}
+    assert faults(replace(FIT, parameters={**without, "MAN_OVERRIDE_SPD": 1.0})) == []
+    assert faults(replace(FIT, parameters={**without, "MAN_OVERRIDE_SPD": -1.0})) == [
+        "MAN_OVERRIDE_SPD is -1, must be >= 0: a pilot's sticks would not end OFFBOARD"
+    ]
+    one_missing = replace(FIT, parameters=without, missing=frozenset({"COM_RC_OVERRIDE"}))
+    assert faults(one_missing) == ["1 of 12 parameters not read yet"]
+    both = frozenset({"COM_RC_OVERRIDE", "MAN_OVERRIDE_SPD"})
+    assert faults(replace(one_missing, missing=both)) == ["COM_RC_OVERRIDE or MAN_OVERRIDE_SPD cannot be read"]

@@ -120,7 +120,7 @@ def test_the_summary_shows_who_commanded_what_and_who_was_killed(capsys: pytest.
             "passed": False,
             "commands": [
                 {
-                    "at_s": 31.4, "verb": "kill", "issuer": "operator-ab12", "revision": 3, "accepted": [3],
+                    "at_s": 31.4, "verb": "kill", "issuer": "operator-ab12", "id": "1f", "accepted": [3],
                     "refused": {"1": "[why] not"}, "unanswered": [2],
                 }
             ],

@@ -49,6 +49,7 @@ class Flight:
         boot_s: float = 0.0,
         seed: int = 1,
         quiet: bool = True,
+        px4_version: str = "1.16",
     ) -> None:
         self.boot_s = boot_s
         self.now_ns = round(boot_s * SECOND_NS)
@@ -63,6 +64,7 @@ class Flight:
             gust=gust,
             noise=noise,
             parameters=parameters,
+            px4_version=px4_version,
             seed=seed,
         )
         self.received: list[tuple[float, Any]] = []

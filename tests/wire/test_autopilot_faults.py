@@ -163,6 +163,17 @@ def test_sticks_take_over_from_offboard_only_with_bit_1_of_com_rc_override(overr
     assert flight.mode is mode
 
 
+@pytest.mark.parametrize(("speed", "mode"), [(-1.0, Mode.OFFBOARD), (0.0, Mode.POSCTL), (1.0, Mode.POSCTL)])
+def test_since_1_18_sticks_take_over_unless_man_override_spd_is_negative(speed: float, mode: Mode) -> None:
+    flight = Flight(parameters={"MAN_OVERRIDE_SPD": speed}, px4_version="1.18")
+    assert "COM_RC_OVERRIDE" not in flight.autopilot.parameters
+    flight.take_off()
+    flight.go_offboard()
+    flight.autopilot.inject(Fault(FaultKind.PILOT_STICKS))
+    flight.stream(flight.setpoint(), 0.5)
+    assert flight.mode is mode
+
+
 def test_kill_switch_drops_the_vehicle_and_disarms_5_s_later() -> None:
     flight = flying()
     flight.autopilot.inject(Fault(FaultKind.RC_KILL))

@@ -332,3 +332,26 @@ def test_a_frames_fields_are_unpacked_as_pymavlink_unpacks_them(payload: bytes, 
     damaged = bytearray(datagram)
     damaged[-1] ^= 1
     assert wire.unpacked(kind, bytes(damaged)) is None
+
+
+@pytest.mark.parametrize(("told", "means"), [(0, 0), (55, 55), (100, 100), (-1, -1), (-5, -1), (101, -1), (127, -1)])
+def test_a_charge_that_is_none_is_unknown(told: int, means: int) -> None:
+    link = MavlinkLink(SYSTEM_ID)
+    message = dialect.MAVLink_sys_status_message(0, 0, 0, 0, 0, 0, told, 0, 0, 0, 0, 0, 0)
+    (event,) = link.decode(bytes(message.pack(autopilot())))
+    assert event == wire.SystemHealth(0, means)
+
+
+def test_an_origin_at_zero_zero_is_none() -> None:
+    link = MavlinkLink(SYSTEM_ID)
+    assert link.decode(bytes(dialect.MAVLink_gps_global_origin_message(0, 0, 488_000, 0).pack(autopilot()))) == []
+    assert link.rejected["out of range"] == 1
+    (event,) = link.decode(bytes(dialect.MAVLink_gps_global_origin_message(1, 0, 0, 0).pack(autopilot())))
+    assert isinstance(event, wire.GlobalOrigin)
+
+
+def test_a_heartbeat_of_what_is_no_autopilot_says_nothing_of_arming_or_mode() -> None:
+    link = MavlinkLink(SYSTEM_ID)
+    invalid = dialect.MAVLink_heartbeat_message(6, dialect.MAV_AUTOPILOT_INVALID, 0, 0, 4, 3)
+    assert link.decode(bytes(invalid.pack(autopilot()))) == []
+    assert link.rejected["heartbeat of no autopilot"] == 1
