@@ -29,7 +29,7 @@ PROPERTY = settings(deadline=None, max_examples=60)
 START_NS = 1_790_000_000_000_000_000
 ZERO = Ned(0.0, 0.0, 0.0)
 LIMITS = PeerLimits(
-    hold="damped", hold_damping_s=0.7, range_m=100.0, stale_after_s=12.0, isolated_flight_s=5.0, uncertainty_m=0.4,
+    hold="damped", hold_damping_s=0.7, range_m=100.0, stale_after_s=12.0, heartbeat_s=5.7, isolated_flight_s=5.0, uncertainty_m=0.4,
     digest_size=3,
 )  # fmt: skip
 OWN = 1
