@@ -1,4 +1,4 @@
-"""Whatever peers do not say, or somebody says in their name: nobody comes near anybody, a lost one's vehicle included."""
+"""Whatever peers do not say, or somebody says in their name: nobody comes near anybody, nor a vehicle that was lost."""
 
 import pytest
 from flights import failsafes, until, wait
