@@ -193,6 +193,8 @@ class _Peer:
     """fleet time until which nothing is built on what it says"""
     twofold_until_ns: int = 0
     """the same, since two sources speak under its id"""
+    noted_until_ns: int = 0
+    """until then another place of it is not noted again: a liar writes no log"""
 
 
 @dataclass(slots=True)
@@ -289,7 +291,8 @@ class PeerTable:
         if peer.tracks:
             track.reached = any(self._leads_to(t, sample) for t in peer.tracks)
             self.rejected[JUMPS] += 1
-            if len(peer.tracks) == 1:
+            if sample.time_ns >= peer.noted_until_ns:
+                peer.noted_until_ns = sample.time_ns + round(self.limits.stale_after_s * 1e9)
                 self.notes.append(f"vehicle {sample.vehicle_id}: {JUMPS}: both places are kept clear of")
             if len(peer.tracks) == TRACKS_MAX:
                 peer.tracks.remove(min(reversed(peer.tracks), key=lambda t: t.sample.time_ns - t.first_ns))
