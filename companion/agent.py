@@ -94,6 +94,8 @@ passed; the trigger fired; a peer is near"""
 CLOCK_SHIFT_NS = 618_033_989
 """times a vehicle's place in the file: by so much its trigger's clock is shifted, so that no two vehicles' periods, of
 whatever length, end together"""
+OWN_ID_ANSWER_NS = 500_000_000
+"""who hears somebody speak under its own id says where it is itself, this often at most"""
 LOOK_PERIOD_NS = 200_000_000
 """who does not steer looks at its peers this often: a crowd on the ground need not work as in the air"""
 
@@ -187,6 +189,8 @@ class Agent:
         """when to propose what follows, if nobody has by then (monotonic)"""
         self._announced = Phase.IDLE
         """the phase that the peers were last told at once"""
+        self._own_id_ns: int | None = None
+        """when somebody else last spoke under this vehicle's id (monotonic)"""
         self._jumps = 0
         self._assignment: str | None = None
         """hash of the first formation's assignment, once asked for"""
@@ -220,6 +224,9 @@ class Agent:
         if topic not in ("state", "plan"):
             self.rejected["peer: unknown topic"] += 1
             return
+        if key.split("/")[-2:-1] == [str(self.id)]:
+            self._heard_own_id(now)
+            return
         try:
             if topic == "plan":
                 if payload == self._plan_payload:
@@ -240,6 +247,21 @@ class Agent:
             if self.id in message.near_ids:
                 self.near.named(now.monotonic_ns)
             self._compare_motions(message, now)
+
+    def _heard_own_id(self, now: Instant) -> None:
+        """Somebody else speaks under this vehicle's id: what it says is not taken, and contradicted at once."""
+        what = Failsafe.OWN_ID
+        self.rejected[what.value] += 1
+        if not self.own_id_heard(now):
+            self._outputs.notes.append(f"{what.value}: it says where it is itself")
+        self._own_id_ns = now.monotonic_ns
+        if not self._resend_ns:
+            self._resend_ns = [max(now.monotonic_ns, self._sent_ns + OWN_ID_ANSWER_NS)]
+
+    def own_id_heard(self, now: Instant) -> bool:
+        """Whether somebody else spoke under this vehicle's id lately."""
+        stale_ns = self.peers.limits.stale_after_s * 1e9
+        return self._own_id_ns is not None and now.monotonic_ns - self._own_id_ns < stale_ns
 
     def receive_presence(self, vehicle_id: int, alive: bool, now: Instant) -> None:
         """A peer's process appeared or ended."""
@@ -361,7 +383,7 @@ class Agent:
             ),
         )  # fmt: skip
 
-    def account(self, now: Instant, own_id_heard: bool = False) -> Account:
+    def account(self, now: Instant) -> Account:
         """The answer to a preflight question."""
         facts = self.autopilot.facts(now)
         if self._assignment is None:
@@ -379,7 +401,7 @@ class Agent:
             slot_ned_m=self.programme.reference(self.id, now.fleet_ns).position_ned_m,
             origin_ned_m=origin,
             home_altitude_amsl_m=facts.home_altitude_amsl_m,
-            own_id_heard=own_id_heard,
+            own_id_heard=self.own_id_heard(now),
             checks=self.checks(now),
         )
 
@@ -570,10 +592,11 @@ class Agent:
         if self._plan_due_ns is not None and now.monotonic_ns >= self._plan_due_ns:
             self._plan_due_ns = None
             out.peers.append(("plan", self._plan_payload))
-        out.notes = [*self.flight.notes, *out.notes, *self.autopilot.notes]
+        out.notes = [*self.flight.notes, *out.notes, *self.peers.notes, *self.autopilot.notes]
         self.flight.notes.clear()
         out.events = [*self.flight.events, *out.events]
         self.flight.events.clear()
+        self.peers.notes.clear()
         self.autopilot.notes.clear()
         self._outputs = Outputs()
         return out
@@ -595,8 +618,9 @@ class Agent:
                 self._mention(now)
             self._announced = self.phase
         if measured is None:
-            if self._resend_ns:
-                # Whoever no longer knows where it is still says so, from the last place it knew.
+            if self._resend_ns and self._observed_ns is not None:
+                # Whoever no longer knows where it is still says so, from the last place it knew. Who never knew in this
+                # life has nothing to tell: its presence says that it is there.
                 self._tell(now, ZERO, self.programme.reference(self.id, now.fleet_ns))
             return
         gap_s = 0.0 if self._observed_ns is None else (now.monotonic_ns - self._observed_ns) * 1e-9

@@ -478,6 +478,7 @@ class FleetConfig(_Table):
             hold_damping_s=self.law.hold_damping_s,
             range_m=self.peers.range_m,
             stale_after_s=STALE_AFTER * self.trigger.t_max_s,
+            heartbeat_s=self.trigger.t_max_s,
             isolated_flight_s=self.peers.isolated_flight_s,
             uncertainty_m=self.prediction_error_m,
             motion=self.peer_motion,

@@ -611,12 +611,13 @@ class Flight:
             self._fail(Failsafe.MISSING, now, detail, Action(peers.missing))
             return not self.forms_without
         silent_s = self.peers.silent_for_s(now)
-        if silent_s is None or silent_s <= peers.isolated_flight_s:
+        deaf = self.peers.deaf(now)
+        if not deaf and (silent_s is None or silent_s <= peers.isolated_flight_s):
             self._alone_since_ns = None
             return False
         if self._alone_since_ns is None:
             self._alone_since_ns = now.monotonic_ns
-            self._fail(Failsafe.ALONE, now)
+            self._fail(Failsafe.DEAF if deaf else Failsafe.ALONE, now)
         elif now.monotonic_ns - self._alone_since_ns > self.config.failsafe.isolated_hold_s * 1e9:
             self._fail(Failsafe.ALONE_FOR_LONG, now)
         return True
@@ -680,7 +681,7 @@ class Flight:
             self._happened(PhaseEvent.REJOINED, now)
 
     def _hears_somebody(self, now: Instant) -> bool:
-        return not self.peers.ids or self.peers.silent_for_s(now) == 0.0
+        return not self.peers.ids or (self.peers.silent_for_s(now) == 0.0 and not self.peers.deaf(now))
 
     def settle(self, ego: VehicleState, reference: Reference, now: Instant) -> None:
         """Notice that the vehicle has taken its slot, or is back over its pad."""

@@ -277,8 +277,7 @@ class Lockstep:
             if agent is None or agent is sender:
                 continue
             if key.split("/")[-2] == str(j):
-                self.own_id_heard[j] += 1  # the process keeps it from its agent
-                continue
+                self.own_id_heard[j] += 1
             if agent is v.agent:
                 self._log(j, "input/peer", key.encode() + b"\0" + payload)
             agent.receive_peer(key, payload, self.now)

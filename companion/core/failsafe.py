@@ -47,6 +47,9 @@ class Failsafe(Enum):
     PEER_FROZEN = "a peer's position frozen"
     PEER_LIES = "a peer's state jumps"
     PEER_CLOCK = "a peer's clock off"
+    TWO_SOURCES = "two sources under one id"
+    OWN_ID = "own id heard from another"
+    DEAF = "nobody's states heard"
     BATTERY_LOW = "battery low"
     BATTERY_CRITICAL = "battery critical"
     BATTERY_UNKNOWN = "battery unknown"
@@ -148,6 +151,12 @@ FAILSAFES: dict[Failsafe, Row] = {
         "`peers.isolated_flight_s` after the last one ended or was silent for 2.1 `trigger.t_max_s`", None, Action.HOLD,
         "", "a peer is heard: it comes back to its slot",
     ),
+    Failsafe.DEAF: Row(
+        "12 heartbeats due from two or more peers that are said to be there, none heard: 1.4 `trigger.t_max_s` with "
+        "ten vehicles, 2.1 with six or fewer", None, Action.HOLD,
+        "the link is gone, not the peers: each is taken to fly on until it must have noticed too, then to stand",
+        "a peer is heard: it comes back to its slot",
+    ),
     Failsafe.ALONE_FOR_LONG: Row("`failsafe.isolated_hold_s` of that hold", None, Action.LAND, "", _NOT),
     Failsafe.APART_FOR_LONG: Row("`peers.wait_s` apart", None, Action.LAND, "no plan was told, say", _NOT),
     Failsafe.PEER_GONE: Row(
@@ -160,12 +169,26 @@ FAILSAFES: dict[Failsafe, Row] = {
         "not used in the formation, all the distance is kept to it, counted", "5 s without another",
     ),
     Failsafe.PEER_LIES: Row(
-        "the first sample beyond what 8 m/s2 and 1 m (1 m/s) explain", 0.0, Action.CONTINUE, "the same",
-        "5 s without another",
+        "the first sample further than 1 m (1 m/s) from what was foreseen, beyond what a second of 8 m/s2 explains, or "
+        "on the ground without a landing", 0.0, Action.CONTINUE,
+        "not used in the formation; all the distance is kept to both places, counted",
+        "one of them is not told of for 2.1 `trigger.t_max_s`; of a vehicle lost in the air while elsewhere one says "
+        "that it stands, for 120 s",
     ),
     Failsafe.PEER_CLOCK: Row(
         "a sample from more than 1 s ahead, or older on arrival than 2.1 `trigger.t_max_s`", 0.0, Action.CONTINUE,
         "refused and counted; then it is silent", "its clock is right",
+    ),
+    Failsafe.TWO_SOURCES: Row(
+        "a boot id that speaks again after another has begun", 0.0, Action.CONTINUE,
+        "not used in the formation; all the distance is kept to every place that is told, counted, noted",
+        "2.1 `trigger.t_max_s` without the other",
+    ),
+    Failsafe.OWN_ID: Row(
+        "the first put under the own id", 0.0, Action.CONTINUE,
+        "not taken; it says at once where it is itself (twice a second at most), counted, noted, no take-off by "
+        "`fleet preflight`; to land for it would let one put end a flight",
+        "2.1 `trigger.t_max_s` without another",
     ),
     Failsafe.BATTERY_LOW: Row(
         "3 s below `failsafe.battery_low_percent`", BATTERY_S, Action.RETURN,

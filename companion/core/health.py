@@ -1,7 +1,7 @@
 """What a vehicle can tell of its own health from what is said: positions that freeze or jump, and what lasts."""
 
 from dataclasses import dataclass
-from math import dist, hypot, inf
+from math import dist, hypot
 
 from companion.core.failsafe import DAMAGE_M, DAMAGE_M_S, FROZEN_S
 from companion.core.frames import Ned
@@ -15,13 +15,12 @@ SIGMAS = 10.0
 
 def jumped(
     before: tuple[Ned, Ned], after: tuple[Ned, Ned], dt_s: float, acceleration_m_s2: float, margin_m: float,
-    margin_m_s: float, speed_m_s: float = inf,
+    margin_m_s: float,
 ) -> bool:  # fmt: skip
-    """Whether two states (position m, velocity m/s) are further apart than an acceleration explains, and a speed that
-    comes to the first's."""
+    """Whether two states (position m, velocity m/s) are further apart than an acceleration explains."""
     (p, v), (q, w) = before, after
     foreseen = Ned(p.north + v.north * dt_s, p.east + v.east * dt_s, p.down + v.down * dt_s)
-    reach = min(0.5 * acceleration_m_s2 * dt_s, speed_m_s) * dt_s
+    reach = 0.5 * acceleration_m_s2 * dt_s * dt_s
     return not (dist(q, foreseen) <= margin_m + reach and dist(v, w) <= margin_m_s + acceleration_m_s2 * dt_s)
 
 

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from companion.agent import Agent, Outputs
-from companion.config import STALE_AFTER, FleetConfig
+from companion.config import FleetConfig
 from companion.core.failsafe import CONFIGURATION_S, Failsafe
 from companion.core.values import Instant
 from companion.errors import CompanionError
@@ -129,10 +129,6 @@ class Companion:
         self._stop_by_ns: int | None = None
         self._last_ns = 0
         self._second_ns = 0
-        self._own_id_heard = 0
-        self._own_id_ns: int | None = None
-        """when somebody else last spoke under this vehicle's id"""
-        self._own_id_memory_ns = round(STALE_AFTER * config.trigger.t_max_s * 1e9)
         self._driver_ns: int | None = None
         """when the position that the next tick follows from was received"""
         self.lateness_ns = 0
@@ -299,14 +295,13 @@ class Companion:
         status = self.agent.status(now)
         counters = self.network.counters
         status["lateness_ms"] = self.lateness_ns * 1e-6
-        status["own_id_heard"] = self._hears_own_id(now.monotonic_ns)
+        status["own_id_heard"] = self.agent.own_id_heard(now)
         status["dropped"] = counters.dropped
         status["recorder_lost"] = 0 if self.recorder is None else self.recorder.lost
         elsewhere = {
             "mavlink: another address than the autopilot's": self.link.strangers,
             "mavlink: could not be sent": self.link.send_failures,
             "peer: malformed": counters.malformed,
-            "peer: under our own id": counters.own_id_heard,
         }
         status["rejected"] |= {kind: count for kind, count in elsewhere.items() if count}
         return json.dumps(status).encode()
@@ -317,20 +312,11 @@ class Companion:
             answered_ns = self.clock.now().fleet_ns
             reading = ClockReading(boot_id=self.boot_id, received_ns=received_ns, answered_ns=answered_ns)
             return reading.model_dump_json().encode()
-        heard = self._hears_own_id(now.monotonic_ns)
-        return self.agent.account(now, own_id_heard=heard).model_dump_json().encode()
-
-    def _hears_own_id(self, now_ns: int) -> bool:
-        """Whether somebody else has spoken under this vehicle's id of late."""
-        heard = self.network.counters.own_id_heard
-        if heard > self._own_id_heard:
-            self._own_id_heard, self._own_id_ns = heard, now_ns
-        return self._own_id_ns is not None and now_ns - self._own_id_ns < self._own_id_memory_ns
+        return self.agent.account(now).model_dump_json().encode()
 
     def _each_second(self, now_ns: int) -> None:
         self._second_ns = now_ns + 1_000_000_000
         self.clock.discipline(latched=self.agent.autopilot.armed)
-        self._hears_own_id(now_ns)
         if self.recorder is not None and self.recorder.failure is not None:
             self._notice(Failsafe.DISK_FULL, now_ns)
         if now_ns >= self._file_due_ns:

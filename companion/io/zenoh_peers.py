@@ -481,7 +481,7 @@ class PeerNetwork:
         if vehicle_id == self._vehicle_id:
             with self._lock:
                 self._counters.own_id_heard += 1
-        elif vehicle_id is None or sample.kind != zenoh.SampleKind.PUT or len(payload) > PAYLOAD_MAX_BYTES:
+        if vehicle_id is None or sample.kind != zenoh.SampleKind.PUT or len(payload) > PAYLOAD_MAX_BYTES:
             with self._lock:
                 self._counters.malformed += 1
         else:

@@ -33,7 +33,7 @@ ESTIMATE_FAULTS = frozenset({"gps_lost", "position_frozen", "estimator_reset", "
 HANDED_OVER = frozenset({Px4Mode.AUTO_LOITER, Px4Mode.POSCTL})
 """the autopilot's hold, and the pilot's: who flies in them without a companion is in somebody's hands"""
 _F = Failsafe
-OF_THE_FLEET = frozenset({_F.MISSING, _F.ALONE, _F.ALONE_FOR_LONG, _F.APART_FOR_LONG})
+OF_THE_FLEET = frozenset({_F.MISSING, _F.ALONE, _F.DEAF, _F.ALONE_FOR_LONG, _F.APART_FOR_LONG})
 """failsafes that a fault of another, or of the network, explains"""
 _NO_POSITION = {_F.POSITION_LOST, _F.POSITION_JUMPED, _F.AUTOPILOT, _F.NOT_ARMED, _F.NO_TAKE_OFF}
 """no position, then one elsewhere; without setpoints the autopilot acts too"""

@@ -381,9 +381,9 @@ def peer_silent() -> tuple[float, float]:
 def not_used(s: Scene, failsafe: Failsafe) -> None:
     assert s.count(failsafe) >= 1
     wait(s.ls, 0.1)
-    (n,) = (n for n in s.ls.vehicles[1].agent._neighbours if n.vehicle_id == 2)
-    assert not n.in_formation
-    assert not n.shares_avoidance
+    places = [n for n in s.ls.vehicles[1].agent._neighbours if n.vehicle_id == 2]
+    assert places
+    assert not any(n.in_formation or n.shares_avoidance for n in places)
     must_go_on(s, Phase.MOVING)
 
 
@@ -422,6 +422,42 @@ def peer_clock() -> tuple[float, float]:
     assert agent.peers.sample(2) is before
     must_go_on(s, Phase.WAITING)
     return 0.0, 0.0
+
+
+def two_sources() -> tuple[float, float]:
+    s = scene(moving=True)
+    s.begin()
+    s.ls.add_twin(2)
+    until(s.ls, 12.0, lambda: s.count(Failsafe.TWO_SOURCES) > 0)
+    not_used(s, Failsafe.TWO_SOURCES)
+    # The first hears the second, and says again where it is.
+    return s.after(Failsafe.TWO_SOURCES.value), 3.0
+
+
+def own_id() -> tuple[float, float]:
+    s = scene(moving=True)
+    wait(s.ls, 1.0)
+    s.begin()
+    sent = s.ls.vehicles[1].agent.messages_sent
+    for _ in range(20):
+        s.ls.inject_peer("fleet/1/state", b"whatever", 1)
+        wait(s.ls, 0.05)
+    assert s.count(Failsafe.OWN_ID) == 20
+    assert 2 <= s.ls.vehicles[1].agent.messages_sent - sent <= 3
+    must_go_on(s, Phase.MOVING)
+    return s.after(Failsafe.OWN_ID.value), 0.0
+
+
+def deaf() -> tuple[float, float]:
+    s = scene(4, change=brief)
+    s.begin()
+    s.ls.drop_topic("state")
+    until(s.ls, 6.0, lambda: all(p in (Phase.APART, Phase.LANDING) for p in s.ls.phases().values()))
+    noticed = s.noted(Failsafe.DEAF)
+    s.ls.restore_topics()
+    until(s.ls, 20.0, lambda: s.ls.all_in(Phase.WAITING))
+    assert distances(truth(s.ls, s.began_s)).min() > 3.0
+    return noticed, 4.2
 
 
 def battery_low() -> tuple[float, float]:
@@ -525,6 +561,7 @@ SCENARIOS: dict[Failsafe, Callable[[], tuple[float, float]]] = {
     Failsafe.NO_TAKE_OFF: no_take_off, Failsafe.ALTITUDE: altitude, Failsafe.MISSING: missing, Failsafe.ALONE: alone,
     Failsafe.ALONE_FOR_LONG: alone_for_long, Failsafe.APART_FOR_LONG: apart_for_long, Failsafe.PEER_GONE: peer_gone,
     Failsafe.PEER_SILENT: peer_silent, Failsafe.PEER_FROZEN: peer_frozen, Failsafe.PEER_LIES: peer_lies,
+    Failsafe.TWO_SOURCES: two_sources, Failsafe.OWN_ID: own_id, Failsafe.DEAF: deaf,
     Failsafe.PEER_CLOCK: peer_clock, Failsafe.BATTERY_LOW: battery_low, Failsafe.BATTERY_CRITICAL: battery_critical,
     Failsafe.BATTERY_UNKNOWN: battery_unknown, Failsafe.LOOP_LATE: loop_late,
     Failsafe.DISK_FULL: lambda: noticed_by_the_process(Failsafe.DISK_FULL),
@@ -554,7 +591,7 @@ def test_actions_are_what_the_scenarios_check() -> None:
     }  # fmt: skip
     assert {f for f, row in FAILSAFES.items() if row.action is Action.RETURN} == {Failsafe.BATTERY_LOW}
     assert {f for f, row in FAILSAFES.items() if row.action is Action.HOLD} == {
-        Failsafe.POSITION_JUMPED, Failsafe.ALONE,
+        Failsafe.POSITION_JUMPED, Failsafe.ALONE, Failsafe.DEAF,
     }  # fmt: skip
 
 

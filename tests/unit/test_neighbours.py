@@ -25,6 +25,7 @@ from companion.core.neighbours import (
     is_outlier,
 )
 from companion.core.plan import Motion, Programme, SlotChange, TurnLeg, VelocityLeg, with_legs
+from companion.core.safety import nearest_hypothesis
 from companion.core.values import Instant, Neighbour, PeerMessage, PeerSample, Phase
 
 PROPERTY = settings(deadline=None, max_examples=60)
@@ -35,8 +36,8 @@ MOTION = PeerMotion(
     speed_m_s=8.0, latency_s=0.1, t_max_s=5.0,
 )  # fmt: skip
 LIMITS = PeerLimits(
-    hold="damped", hold_damping_s=0.7, range_m=100.0, stale_after_s=12.0, isolated_flight_s=5.0, uncertainty_m=0.4,
-    motion=MOTION, digest_size=3,
+    hold="damped", hold_damping_s=0.7, range_m=100.0, stale_after_s=12.0, heartbeat_s=5.7, isolated_flight_s=5.0,
+    uncertainty_m=0.4, motion=MOTION, digest_size=3,
 )  # fmt: skip
 OWN = 1
 
@@ -86,6 +87,15 @@ def predicted(t: PeerTable, seconds: float, gated: bool = False) -> dict[int, Ne
     return {n.vehicle_id: n for n in t.predict(own, now, moment, gated)}
 
 
+def places(t: PeerTable, seconds: float, vehicle: int) -> list[Neighbour]:
+    """Every place that is kept clear of for one vehicle."""
+    now = at(seconds)
+    motion = t.programme.at(now.fleet_ns)
+    moment = motion.moment(now.fleet_ns)
+    found = t.predict(moment.slot(motion.slots[OWN]).position_ned_m, now, moment, False)
+    return [n for n in found if n.vehicle_id == vehicle]
+
+
 # -- what is refused -------------------------------------------------------------------------------------------------
 
 
@@ -121,44 +131,38 @@ def test_a_refused_message_brings_no_digest_and_no_presence() -> None:
     assert t.phases() == dict.fromkeys((2, 3, 4, 5))
 
 
-@pytest.mark.parametrize(
-    ("first", "second", "taken"),
-    [
-        (5, 6, True),
-        (5, 5, False),
-        (5, 4, False),
-        (0, (1 << 31) - 1, True),
-        (0, 1 << 31, False),
-        ((1 << 32) - 1, 0, True),  # past the end of the counter
-        ((1 << 32) - 2, 3, True),
-        (3, (1 << 32) - 2, False),
-    ],
-)
-def test_sequence_numbers_are_compared_round_the_counter(first: int, second: int, taken: bool) -> None:
+def test_samples_are_ordered_by_their_time_and_a_repeat_is_refused() -> None:
     t = table()
-    assert t.accept(message(sample(t, 2, 1.0), first), at(1.0)) is None
-    assert (t.accept(message(sample(t, 2, 2.0), second), at(2.0)) is None) is taken
-    assert t.rejected["repeated or out of order"] == (0 if taken else 1)
-    newest = t.sample(2)
-    assert newest is not None
-    assert newest.time_ns == ns(2.0 if taken else 1.0)
+    t.accept(message(sample(t, 2, 2.0)), at(2.0))
+    for seconds in (2.0, 1.0):
+        assert t.accept(message(sample(t, 2, seconds)), at(2.5)) == "repeated or out of order"
+    assert t.accept(message(sample(t, 2, 2.5)), at(2.5)) is None
+    assert t.rejected == {"repeated or out of order": 2}
 
 
-def test_a_restarted_peer_counts_from_anywhere() -> None:
+@pytest.mark.parametrize("forged", [(1 << 31) - 4, (1 << 32) - 1, 0])
+def test_a_forged_sequence_number_makes_nobody_deaf(forged: int) -> None:
     t = table()
-    t.accept(message(sample(t, 2, 1.0), 900, boot_id=7), at(1.0))
-    assert t.accept(message(sample(t, 2, 2.0), 0, boot_id=8), at(2.0)) is None
-    assert t.boot_id(2) == 8
-    assert t.accept(message(sample(t, 2, 3.0), 0, boot_id=8), at(3.0)) == "repeated or out of order"
+    t.accept(message(sample(t, 2, 1.0), 5), at(1.0))
+    t.accept(message(sample(t, 2, 1.5), forged), at(1.5))
+    assert t.accept(message(sample(t, 2, 2.0), 6), at(2.0)) is None
+    assert predicted(t, 2.0)[2].in_formation
+
+
+def test_a_sample_from_slightly_ahead_silences_the_peer_no_longer_than_that() -> None:
+    t = table()
+    t.accept(message(sample(t, 2, 1.0)), at(1.0))
+    t.accept(message(sample(t, 2, 1.0 + FUTURE_LIMIT_S)), at(1.0))
+    assert t.accept(message(sample(t, 2, 1.5)), at(1.5)) == "repeated or out of order"
+    assert t.accept(message(sample(t, 2, 2.1)), at(2.1)) is None
 
 
 @PROPERTY
 @given(st.lists(st.tuples(st.integers(2, 5), st.floats(0.0, 30.0)), min_size=1, max_size=30))
 def test_the_newest_sample_stays_whatever_the_order_of_arrival(arrivals: list[tuple[int, float]]) -> None:
     t = table(stale_after_s=60.0)
-    for k, (vehicle, seconds) in enumerate(arrivals):
-        other = 2 if vehicle != 2 else 3
-        t.accept(message(sample(t, other, 0.0), k, digest=(sample(t, vehicle, seconds),)), at(30.0))
+    for vehicle, seconds in arrivals:
+        t.accept(message(sample(t, vehicle, seconds)), at(30.0))
     for vehicle in {v for v, _ in arrivals}:
         kept = t.sample(vehicle)
         assert kept is not None
@@ -324,8 +328,24 @@ def test_a_peer_whose_state_no_motion_explains_is_kept_away_from_for_a_while(
     n = predicted(t, 1.6)[2]
     assert n.in_formation is n.shares_avoidance is not lies
     assert t.rejected == ({"a peer's state jumps": 1} if lies else {})
-    assert predicted(t, 6.4)[2].in_formation is not lies
-    assert predicted(t, 6.6)[2].in_formation
+    assert len(places(t, 1.6, 2)) == (2 if lies else 1)
+    # A while later what it says is a motion that both explain.
+    later = sample(t, 2, 6.0)
+    t.accept(message(moved(later, east=1.0), 3), at(6.0))
+    assert predicted(t, 6.0)[2].in_formation
+    assert len(places(t, 6.0, 2)) == 1
+
+
+def test_of_two_places_the_one_that_is_not_told_of_is_left_after_as_long_as_a_peer_may_be_silent() -> None:
+    t = table()
+    t.accept(message(sample(t, 2, 1.0), 1), at(1.0))
+    for k, seconds in enumerate((2.5, 7.0, 12.0, 14.4)):
+        t.accept(message(moved(sample(t, 2, seconds), east=9.0), 2 + k), at(seconds))
+        assert len(places(t, seconds, 2)) == 2
+    assert not predicted(t, 14.4)[2].in_formation
+    (n,) = places(t, 14.6, 2)
+    assert n.in_formation
+    assert n.position_ned_m.east == pytest.approx(9.0)
 
 
 def test_a_peer_that_moves_without_changing_its_position_is_not_used() -> None:
@@ -610,17 +630,28 @@ def test_a_lost_peer_is_a_neighbour_beside_the_middle_of_its_line(beside_m: floa
 
 
 @pytest.mark.parametrize("phase", [Phase.LANDED, Phase.PREFLIGHT, Phase.IDLE])
-def test_a_lost_peer_that_was_not_in_formation_has_one_place(phase: Phase) -> None:
+def test_a_lost_peer_that_stood_on_the_ground_has_one_place(phase: Phase) -> None:
     t = table()
-    t.accept(message(sample(t, 2, 0.0, phase, velocity_ned_m_s=ZERO)), at(0.0))
+    pad = Ned(4.0, 0.0, -1.0)
+    t.accept(message(sample(t, 2, 0.0, phase, position_ned_m=pad, velocity_ned_m_s=ZERO)), at(0.0))
     t.presence(2, False, at(1.0))
     n = predicted(t, 30.0)[2]
     assert n.other_end_ned_m is None
-    assert n.position_ned_m == t.programme.reference(2, ns(0.0)).position_ned_m
+    assert n.position_ned_m == pad
 
 
-def lost_by_presence() -> PeerTable:
+def test_a_lost_peer_whose_companion_had_started_in_flight_is_there_or_beneath() -> None:
     t = table()
+    there = Ned(4.0, 0.0, -8.0)
+    t.accept(message(sample(t, 2, 0.0, Phase.IDLE, position_ned_m=there, velocity_ned_m_s=ZERO)), at(0.0))
+    assert predicted(t, 1.0)[2].other_end_ned_m is None
+    t.presence(2, False, at(1.0))
+    n = predicted(t, 30.0)[2]
+    assert {n.position_ned_m, n.other_end_ned_m} == {there, there._replace(down=0.0)}
+
+
+def lost_by_presence(**limits: object) -> PeerTable:
+    t = table(**limits)
     t.accept(message(sample(t, 2, 0.0), 1), at(0.0))
     t.presence(2, False, at(6.0))
     return t
@@ -666,6 +697,211 @@ def test_hearsay_brings_a_silent_peer_back() -> None:
     n = predicted(t, 13.0)[2]
     assert n.in_formation
     assert n.other_end_ned_m is None
+
+
+# -- one examination for every sample ----------------------------------------------------------------------------------
+
+
+def moved(s: PeerSample, north: float = 0.0, east: float = 0.0, down: float = 0.0) -> PeerSample:
+    p = s.position_ned_m
+    return s._replace(position_ned_m=Ned(p.north + north, p.east + east, p.down + down))
+
+
+def heard(t: PeerTable, vehicle: int = 2, until_s: int = 4) -> PeerTable:
+    for second in range(1, until_s + 1):
+        t.accept(message(sample(t, vehicle, float(second)), second), at(float(second)))
+    return t
+
+
+@pytest.mark.parametrize("boot_id", [7, 8])
+@pytest.mark.parametrize("phase", [Phase.FORMED, Phase.APART, Phase.LANDED, Phase.IDLE])
+def test_a_state_that_nothing_explains_is_another_place_beside_the_old_one(boot_id: int, phase: Phase) -> None:
+    t = heard(table())
+    lie = moved(sample(t, 2, 5.0, phase), north=30.0)
+    assert t.accept(message(lie, 6, boot_id), at(5.0)) is None
+    told, kept = places(t, 5.0, 2)
+    assert told.position_ned_m == pytest.approx(lie.position_ned_m)
+    assert kept.position_ned_m == pytest.approx(sample(t, 2, 5.0).position_ned_m)
+    assert not any(n.in_formation or n.shares_avoidance for n in (told, kept))
+    assert t.rejected["a peer's state jumps"] == 1
+    # Its own next word decides nothing yet, and later everything.
+    assert t.accept(message(sample(t, 2, 5.5), 7), at(5.5)) is None
+    assert len(places(t, 5.5, 2)) == 2
+
+
+@pytest.mark.parametrize("phase", [Phase.LANDED, Phase.IDLE])
+def test_nobody_is_believed_to_have_landed_without_a_landing(phase: Phase) -> None:
+    t = heard(table())
+    t.accept(message(sample(t, 2, 4.5, phase, velocity_ned_m_s=ZERO), 5), at(4.5))
+    aloft = [n for n in places(t, 5.0, 2) if n.velocity_ned_m_s.north > 0.9] if phase is Phase.LANDED else [1]
+    assert aloft, "it is still flown around where it should be"
+
+
+def test_a_landing_that_is_told_of_is_believed() -> None:
+    t = heard(table())
+    where = sample(t, 2, 4.5).position_ned_m
+    for k, (seconds, phase, down) in enumerate(
+        ((4.5, Phase.LANDING, -10.0), (9.0, Phase.LANDING, -7.0), (13.0, Phase.LANDED, -5.0))
+    ):
+        t.accept(
+            message(
+                sample(
+                    t, 2, seconds, phase, position_ned_m=where._replace(down=down), velocity_ned_m_s=Ned(0.0, 0.0, 1.0)
+                ),
+                5 + k,
+            ),
+            at(seconds),
+        )
+    assert len(places(t, 13.0, 2)) == 1
+    assert t.phases()[2] is Phase.LANDED
+    assert t.rejected == {}
+
+
+def test_a_digest_opens_no_place_and_moves_nobody_far() -> None:
+    t = heard(table())
+    for k, lie in enumerate((
+        moved(sample(t, 2, 4.5), north=30.0),
+        moved(sample(t, 2, 4.5), north=2.5),
+        sample(t, 2, 4.5, Phase.LANDED),
+        sample(t, 2, 4.5, Phase.LANDING),
+    )):  # fmt: skip
+        assert t.accept(message(sample(t, 3, 4.6 + 0.1 * k), k, digest=(lie,)), at(5.0)) is None
+    assert t.rejected == {"digest: contradicts what was heard": 4}
+    (n,) = places(t, 5.0, 2)
+    assert n.in_formation
+    assert n.position_ned_m == pytest.approx(sample(t, 2, 5.0).position_ned_m)
+    # Within what a message would have told, and step after step, it is taken, but never further from what was heard.
+    for k in range(40):
+        creep = moved(sample(t, 2, 5.0 + 0.02 * k), north=0.1 * k)
+        t.accept(message(sample(t, 3, 5.0 + 0.02 * k), 9 + k, digest=(creep,)), at(6.0))
+    (n,) = places(t, 6.0, 2)
+    assert 1.0 < dist(n.position_ned_m, sample(t, 2, 6.0).position_ned_m) <= 2.01
+
+
+def test_two_processes_under_one_id_are_a_fault_of_that_id() -> None:
+    t = table()
+    for k in range(4):
+        t.accept(message(sample(t, 2, 1.0 + k), k, boot_id=(7, 8)[k % 2]), at(1.0 + k))
+    assert t.rejected == {"two sources under one id": 1}
+    assert [n.split(":")[1].strip() for n in t.notes] == ["two sources under one id"]
+    (n,) = places(t, 4.0, 2)
+    assert not n.in_formation
+    assert not n.shares_avoidance
+    t.accept(message(sample(t, 2, 9.0), 9, boot_id=8), at(9.0))
+    assert not predicted(t, 14.9)[2].in_formation
+    assert predicted(t, 15.1)[2].in_formation
+
+
+def test_a_peer_that_restarts_is_one_source() -> None:
+    t = heard(table())
+    for k in range(3):
+        t.accept(message(sample(t, 2, 5.0 + k), k, boot_id=8), at(5.0 + k))
+    assert t.accept(message(sample(t, 2, 4.5), 5, boot_id=7), at(7.0)) == "repeated or out of order"
+    assert t.rejected == {"repeated or out of order": 1}
+    assert predicted(t, 7.0)[2].in_formation
+
+
+def test_a_flood_of_places_does_not_push_out_the_one_that_lasted() -> None:
+    t = heard(table())
+    for k in range(20):
+        t.accept(message(moved(sample(t, 2, 4.1 + 0.01 * k), north=20.0 * (k + 2)), k, boot_id=k), at(5.0))
+    truth = sample(t, 2, 5.0).position_ned_m
+    assert min(dist(n.position_ned_m, truth) for n in places(t, 5.0, 2)) < 0.01
+    assert len(places(t, 5.0, 2)) <= 3
+
+
+def test_one_lost_in_the_air_that_tells_from_the_ground_elsewhere_is_believed_after_two_minutes() -> None:
+    t = lost_by_presence(range_m=300.0)
+    t.presence(2, True, at(8.0))
+    pad = Ned(-20.0, 5.0, 0.0)
+    for second in range(8, 135, 5):
+        t.accept(
+            message(sample(t, 2, float(second), Phase.IDLE, position_ned_m=pad, velocity_ned_m_s=ZERO), second, 8),
+            at(float(second)),
+        )
+        found = places(t, float(second), 2)
+        assert len(found) == (2 if second <= 128 else 1)
+        assert found[0].position_ned_m == pad
+    assert t.phases()[2] is Phase.IDLE
+
+
+@pytest.mark.parametrize("down", [-10.0, -4.0, 0.0])
+def test_one_lost_in_the_air_comes_back_near_where_it_may_be_or_beneath(down: float) -> None:
+    t = lost_by_presence()
+    near = Ned(8.0, 3.0, down)
+    t.accept(message(sample(t, 2, 20.0, Phase.IDLE, position_ned_m=near, velocity_ned_m_s=ZERO), 1, 8), at(20.0))
+    (n,) = places(t, 20.0, 2)
+    assert n.position_ned_m == near
+    assert n.other_end_ned_m is None
+
+
+# -- the path of the lost, and who hears nobody ------------------------------------------------------------------------
+
+
+def test_a_peer_lost_in_a_turn_is_kept_clear_of_along_its_arc_and_not_its_chord() -> None:
+    turn = column_at_1_m_s(legs=(TurnLeg(0.2, inf),))
+    t = table(turn, isolated_flight_s=20.0)
+    t.accept(message(sample(t, 2, 20.0)), at(20.0))
+    t.presence(2, False, at(21.0))
+    now = at(34.0)
+    moment = turn.moment(now.fleet_ns)
+    for second in range(20, 35):
+        on_the_arc = turn.reference(2, ns(float(second))).position_ned_m
+        (n,) = (n for n in t.predict(on_the_arc, now, moment, False) if n.vehicle_id == 2)
+        assert n.other_end_ned_m is not None
+        assert dist(n.position_ned_m, n.other_end_ned_m) <= 0.201
+        assert dist(nearest_hypothesis(on_the_arc, n)[0], on_the_arc) < 0.03
+    a, b = (turn.reference(2, ns(x)).position_ned_m for x in (20.0, 34.0))
+    middle = Ned(*(0.5 * (x + y) for x, y in zip(a, b, strict=True)))
+    (n,) = (n for n in t.predict(middle, now, moment, False) if n.vehicle_id == 2)
+    assert dist(nearest_hypothesis(middle, n)[0], middle) > 3.0
+    end = turn.reference(2, now.fleet_ns)
+    _, velocity = nearest_hypothesis(end.position_ned_m, t.predict(end.position_ned_m, now, moment, False)[0])
+    assert velocity == pytest.approx(end.velocity_ned_m_s, abs=0.05)
+
+
+def test_who_hears_nobody_is_deaf_when_heartbeats_of_all_are_missing() -> None:
+    t = table(heartbeat_s=5.0, stale_after_s=15.0)
+    for k, vehicle in enumerate((2, 3, 4, 5)):
+        t.accept(message(sample(t, vehicle, 1.0 + k)), at(1.0 + k))
+    assert not t.deaf(at(19.0))
+    assert t.deaf(at(19.1))  # 4 s, and 15 s more
+    # Nobody is lost before it, too, has heard nobody for so long; then it stood no earlier.
+    assert len([n for i, n in predicted(t, 17.9).items() if n.in_formation]) == 4
+    lost = predicted(t, 19.1)
+    assert not any(n.in_formation for n in lost.values())
+    assert lost[3].other_end_ned_m == pytest.approx(t.programme.reference(3, ns(19.0)).position_ned_m)
+    assert lost[5].other_end_ned_m == pytest.approx(t.programme.reference(5, ns(18.0)).position_ned_m)
+    t.accept(message(sample(t, 4, 20.0)), at(20.0))
+    assert not t.deaf(at(20.0))
+
+
+@pytest.mark.parametrize(("count", "after_s"), [(3, 21.0), (5, 21.0), (10, 13.8), (13, 10.5), (30, 10.5)])
+def test_the_more_peers_are_to_be_heard_the_sooner_their_silence_is_no_chance(count: int, after_s: float) -> None:
+    t = table(column_at_1_m_s(count), heartbeat_s=10.0, stale_after_s=21.0)
+    for vehicle in range(2, count + 1):
+        t.accept(message(sample(t, vehicle, 1.0)), at(1.0))
+    assert not t.deaf(at(0.9 + after_s))
+    assert t.deaf(at(1.1 + after_s))
+
+
+def test_one_that_alone_is_silent_may_have_stopped_at_any_time() -> None:
+    t = table()
+    for vehicle in (2, 3, 4):
+        t.accept(message(sample(t, vehicle, 1.0)), at(1.0))
+    for second in range(5, 20, 4):
+        for vehicle in (3, 4):
+            t.accept(message(sample(t, vehicle, float(second)), second), at(float(second)))
+    found = predicted(t, 18.0)
+    assert found[2].other_end_ned_m == pytest.approx(t.programme.reference(2, ns(1.0)).position_ned_m)
+    assert found[3].in_formation
+    assert not t.deaf(at(18.0))
+
+
+def test_of_two_vehicles_none_is_deaf() -> None:
+    t = table(column_at_1_m_s(2))
+    t.accept(message(sample(t, 2, 1.0)), at(1.0))
+    assert not t.deaf(at(100.0))
 
 
 def test_presence_of_strangers_is_counted_and_of_oneself_ignored() -> None:
