@@ -13,10 +13,12 @@ from typing import Any
 
 from companion.autopilot import AutopilotClient
 from companion.config import FleetConfig
+from companion.core.budget import Bucket, ExaminationBudget
 from companion.core.estimate import BiasObserver, SendFilter
 from companion.core.failsafe import LATE_S, Failsafe
 from companion.core.frames import Ned, geodetic_to_ned
 from companion.core.law import finish, pair, separation, total
+from companion.core.motion_check import Fault, examine
 from companion.core.neighbours import PeerTable, held
 from companion.core.plan import (
     PADS,
@@ -26,12 +28,8 @@ from companion.core.plan import (
     assignment_matches,
     motion_order,
     over_the_pads,
-    top_speed_m_s,
-    with_formation,
     with_legs,
-    with_return,
 )
-from companion.core.route import first_breach, only_stops
 from companion.core.safety import SafetyFilter
 from companion.core.trigger import exceeds, switching_exceeds
 from companion.core.values import (
@@ -66,11 +64,15 @@ RESEND_NS = (250_000_000, 1_000_000_000)
 """a change of phase or motion is repeated after these delays, since one message may be lost"""
 OUT_OF_FORMATION = frozenset({Phase.IDLE, Phase.APART, Phase.LANDING, Phase.LANDED, Phase.RELEASED})
 """phases of peers for which nobody waits any more once the formation has been taken"""
-LEVEL_M_S = 1e-6
 RESENDS_MAX = 8
 CATCH_UP_NS = 1_000_000_000
 SPREAD_NS = 50_000_000
 """times the vehicles, up to CATCH_UP_NS: over this time they spread what all have reason to say at once"""
+COMMAND_LOOKS_PER_S, COMMAND_LOOKS_MOST = 400.0, 2000.0
+"""what examining commanded motions may cost (`core.budget`)"""
+DECODING_LOOKS_PER_BYTE = 0.002
+REFUSED_KEPT = 8
+"""so many plans that were refused for what they are, not for when they came, are not examined again"""
 PLAN_COPIES = 2
 """a plan that this many others have just told need not be told again"""
 LOOK_PERIOD_NS = 200_000_000
@@ -155,6 +157,9 @@ class Agent:
         self._resend_ns: list[int] = []
         self._plan_due_ns: int | None = None
         self._plan_payload = encode_motion(self.programme.newest)
+        self._refused_plans: list[bytes] = []
+        self._plans_budget = ExaminationBudget(others)
+        self._commands_budget = Bucket(COMMAND_LOOKS_PER_S, COMMAND_LOOKS_MOST)
         self._plan_told = 0
         """how often others told it since our telling became due"""
         self._spread_ns = min(SPREAD_NS * len(config.vehicles), CATCH_UP_NS)
@@ -192,12 +197,7 @@ class Agent:
             return
         try:
             if topic == "plan":
-                if payload == self._plan_payload:
-                    self._plan_told += 1
-                    if self._plan_told >= PLAN_COPIES:
-                        self._plan_due_ns = None
-                else:
-                    self._consider(decode_motion(payload), now)
+                self._receive_plan(key, payload, now)
                 return
             message = decode_state(payload)
         except WireError as error:
@@ -208,6 +208,26 @@ class Agent:
             return
         if self.peers.accept(message, now) is None:
             self._compare_motions(message, now)
+
+    def _receive_plan(self, key: str, payload: bytes, now: Instant) -> None:
+        if payload == self._plan_payload:
+            self._plan_told += 1
+            if self._plan_told >= PLAN_COPIES:
+                self._plan_due_ns = None
+            return
+        sender = next((i for i in self.peers.ids if key.endswith(f"/{i}/plan")), None)
+        if sender is None:
+            self.rejected["plan: foreign id"] += 1
+        elif payload in self._refused_plans:
+            self.rejected["plan: refused before"] += 1
+        elif not self._plans_budget.open(sender, now.monotonic_ns):
+            self.rejected["plan: more than can be examined"] += 1
+        else:
+            self._plans_budget.spend(sender, 1.0 + DECODING_LOOKS_PER_BYTE * len(payload))
+            fault, looks = self._consider(decode_motion(payload), now)
+            self._plans_budget.spend(sender, looks)
+            if fault is not None and fault.lasting:
+                self._refused_plans = [*self._refused_plans[1 - REFUSED_KEPT :], payload]
 
     def receive_presence(self, vehicle_id: int, alive: bool, now: Instant) -> None:
         """A peer's process appeared or ended."""
@@ -255,12 +275,17 @@ class Agent:
             case "kill":
                 confirmed = order.fields.get("confirm") is True
                 return self.flight.kill(now) if confirmed else "kill needs its confirmation"
+        if not self._commands_budget.open(now.monotonic_ns):
+            self.rejected["command: more than can be examined"] += 1
+            return "too many motions at once: command it again"
         try:
             motion = decode_motion(json.dumps(order.fields.get("motion")).encode())
         except WireError as error:
             self.rejected["command: motion"] += 1
             return str(error)
-        return self._consider(motion, now)
+        fault, looks = self._consider(motion, now)
+        self._commands_budget.spend(1.0 + looks)
+        return None if fault is None else fault.sentence
 
     def _reply(self, refusal: str | None) -> bytes:
         answer = {
@@ -351,46 +376,50 @@ class Agent:
 
     # -- motions -----------------------------------------------------------------------------------------------------
 
-    def _consider(self, motion: Motion, now: Instant) -> str | None:
-        """Adopt a motion of somebody else's if it is newer and sound; returns why it was refused."""
-        if motion.order <= self.programme.newest.order:
-            known = self.programme.newest.order == motion.order
-            return None if known else f"revision {motion.revision} is not newer than {self.programme.newest.revision}"
-        refusal = self._unsound(motion, now)
-        if refusal is not None:
-            self.rejected[f"plan: {refusal.split(',')[0]}"] += 1
-            return refusal
-        self._adopt(motion, now)
-        return None
+    def _consider(self, motion: Motion, now: Instant) -> tuple[Fault | None, float]:
+        """Adopt a motion of somebody else's if it is newer and sound; why it was refused, and the looks it took."""
+        newest = self.programme.newest
+        if motion.order <= newest.order:
+            sentence = f"revision {motion.revision} is not newer than {newest.revision}"
+            return None if newest.order == motion.order else Fault("not newer", sentence), 0.0
+        fault, looks = self._unsound(motion, now)
+        if fault is not None:
+            self.rejected[f"plan: {fault.kind}"] += 1
+        else:
+            self._adopt(motion, now)
+        return fault, looks
 
-    def _unsound(self, motion: Motion, now: Instant) -> str | None:
-        if motion.revision > self.programme.newest.revision + REVISION_JUMP_MAX:
-            return f"its revision {motion.revision} is more than {REVISION_JUMP_MAX} ahead"
-        if set(motion.slots) != set(self.programme.newest.slots):
-            return "its vehicles are not this fleet's"
+    def _unsound(self, motion: Motion, now: Instant) -> tuple[Fault | None, float]:
+        """Why a motion cannot follow the newest, and the looks that it took; what is cheap to see comes first."""
+        newest = self.programme.newest
+        if motion.revision > newest.revision + REVISION_JUMP_MAX:
+            sentence = f"its revision {motion.revision} is more than {REVISION_JUMP_MAX} ahead"
+            return Fault("its revision is too far ahead", sentence), 0.0
+        if motion.slots.keys() != newest.slots.keys():
+            return Fault("its vehicles are not this fleet's", "its vehicles are not this fleet's"), 0.0
         if abs(motion.start_ns - now.fleet_ns) > 3_600_000_000_000:
-            return "it starts more than an hour from now; are the clocks set?"
-        fastest = top_speed_m_s(motion)
-        if not fastest <= self.config.limits.speed_max_m_s:
-            return f"its centre flies at more than {self.config.limits.speed_max_m_s:g} m/s, at {fastest:.1f} m/s"
-        breach = first_breach(motion, self.config.geofence)
-        if breach is not None and not only_stops(motion, self.programme.newest):
-            return f"it leads outside the fence, {breach.sentence()}"
-        if motion.then == "stay" and abs(motion.climb_at_end_m_s) > LEVEL_M_S:
-            return "it climbs or sinks for ever; give an altitude to go to"
+            sentence = "it starts more than an hour from now; are the clocks set?"
+            return Fault("it starts more than an hour from now", sentence), 0.0
         away_m = self._away_m(motion, now)
         if not away_m <= self.config.peers.range_m:
-            return f"it begins out of range, {away_m:.0f} m from where this vehicle is to be"
+            sentence = f"it begins out of range, {away_m:.0f} m from where this vehicle is to be"
+            return Fault("it begins out of range", sentence), 1.0
+        fault, looks = examine(motion, self.config.motion_limits, newest)
+        return fault or self._foreign_slots(motion), looks
+
+    def _foreign_slots(self, motion: Motion) -> Fault | None:
+        """Slots that this vehicle would not assign from its own configuration."""
         if motion.shape == PADS:
+            kind = "its pads are not this vehicle's"
             same = over_the_pads(motion, self.config.first_motion)
-            return None if same else "its pads are not this vehicle's; do the configurations differ?"
-        try:
-            slots = self.config.slots(motion.shape)
-        except ConfigError as error:
-            return str(error)
-        if not assignment_matches(motion, slots, self.config.pinned):
-            return "its slots are not what this vehicle assigns; do the configurations differ?"
-        return None
+        else:
+            kind = "its slots are not what this vehicle assigns"
+            try:
+                slots = self.config.slots(motion.shape)
+            except ConfigError as error:
+                return Fault("its shape", str(error))
+            same = assignment_matches(motion, slots, self.config.pinned)
+        return None if same else Fault(kind, f"{kind}; do the configurations differ?")
 
     def _away_m(self, motion: Motion, now: Instant) -> float:
         """How far the own slot jumps when a motion begins (m); a vehicle that does not fly jumps nowhere."""
@@ -455,8 +484,9 @@ class Agent:
             self._return(self._return_motion(max(start_ns, newest.start_ns + 1)), now)
         elif forms:
             self._adopt(self._formation_motion(self.config.formation.shape, start_ns), now)
-        elif legs := self.config.plan_legs(newest.moment(start_ns).centre.position):
-            then = self.config.plan.then
+        elif self.config.plan.legs:
+            centre = newest.moment(start_ns).centre
+            legs, then = self.config.plan_legs(centre.position, centre.velocity), self.config.plan.then
             self._adopt(with_legs(newest, at_ns=start_ns, issuer=self.id, legs=legs, then=then), now)
 
     def _all_up(self) -> bool:
@@ -465,17 +495,14 @@ class Agent:
 
     def _return(self, motion: Motion, now: Instant) -> None:
         """Propose the way back, or land here where it would lead outside the fence: the others would refuse it."""
-        reason = self._unsound(motion, now)
-        if reason is None:
+        fault, _ = self._unsound(motion, now)
+        if fault is None:
             self._adopt(motion, now)
         else:
-            self.flight.no_way_back(reason, now)
+            self.flight.no_way_back(fault.sentence, now)
 
     def _return_motion(self, start_ns: int) -> Motion:
-        return with_return(
-            self.programme.newest, self.config.first_motion, at_ns=start_ns, issuer=self.id,
-            speed_m_s=self.config.return_speed_m_s,
-        )  # fmt: skip
+        return self.config.motion_home(self.programme.newest, start_ns, self.id)
 
     def _all_formed(self, now: Instant) -> bool:
         """This vehicle has formed, and every peer that flies with it, under the newest motion; or all waited long.
@@ -496,10 +523,7 @@ class Agent:
         return True
 
     def _formation_motion(self, shape: str, start_ns: int) -> Motion:
-        return with_formation(
-            self.programme.newest, at_ns=start_ns, issuer=self.id, shape=shape, slots=self.config.slots(shape),
-            pinned=self.config.pinned, speed_m_s=self.config.limits.speed_max_m_s / 2,
-        )  # fmt: skip
+        return self.config.motion_into(shape, self.programme.newest, start_ns, self.id)
 
     # -- time --------------------------------------------------------------------------------------------------------
 

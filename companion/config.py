@@ -26,22 +26,37 @@ from companion.core.frames import Geodetic, Ned
 from companion.core.hold import HoldKind
 from companion.core.law import Gains, paper_gains
 from companion.core.monitor import prediction_error_bound_m
+from companion.core.motion_check import (
+    ALTITUDE_MIN_M,
+    DURATION_MAX_S,
+    LEGS_MAX,
+    PLACE_MAX_M,
+    PLAN_SPEED_SHARE,
+    TURN_ANGLE_MAX_DEG,
+    TURN_ANGLE_MIN_DEG,
+    TURN_RATE_MAX_DEG_S,
+    TURN_RATE_MIN_DEG_S,
+    VELOCITY_MAX_M_S,
+    Fault,
+    MotionLimits,
+    examine,
+)
 from companion.core.neighbours import PeerLimits
 from companion.core.plan import (
     PADS,
-    GotoLeg,
     Leg,
     Motion,
     SlotChange,
     Then,
     TurnLeg,
     VelocityLeg,
-    goto_duration_s,
+    goto_leg,
+    leg_end,
+    top_speed_m_s,
     with_formation,
     with_legs,
     with_return,
 )
-from companion.core.route import first_breach
 from companion.core.safety import DOWNWASH_RATIO, SafetyLimits, safety_radius_m
 from companion.core.trigger import RAISED_MAX_M, ErrorTrigger, Spacing, SwitchingTrigger, TriggerKind
 from companion.core.values import ZERO
@@ -54,14 +69,8 @@ Gain = Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)]
 Percent = Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)]
 VehicleId = Annotated[int, Field(ge=1, le=250)]
 
-PLAN_SPEED_SHARE = 0.75
-"""part of the speed limits that the plan may ask for; the rest is left to keep up with it"""
-TURN_RATE_MIN_DEG_S = 0.01
-"""slower turns are refused: their arcs are straight lines to a double's precision"""
 LANDED_APART_M = 1.0
 """vehicles that land where they are come down so far apart: a collision's distance, and the wander of both"""
-ALTITUDE_MIN_M = 1.0
-"""no slot lower than this above the fleet origin"""
 SPACING_MARGIN_M = 0.2
 """slots stay this much farther apart than separation and barrier begin to act"""
 STALE_AFTER = 2.1
@@ -103,33 +112,38 @@ class FormationTable(_Table):
     """slots of shape "custom": forward, right, down"""
 
 
+LegDuration = Annotated[float, Field(ge=0, le=DURATION_MAX_S, allow_inf_nan=False)]
+LegVelocity = Annotated[float, Field(ge=-VELOCITY_MAX_M_S, le=VELOCITY_MAX_M_S, allow_inf_nan=False)]
+
+
 class HoldLegTable(_Table):
     kind: Literal["hold"]
-    duration_s: NotNegative
+    duration_s: LegDuration
 
 
 class VelocityLegTable(_Table):
     kind: Literal["velocity"]
-    north_m_s: Real = 0.0
-    east_m_s: Real = 0.0
-    up_m_s: Real = 0.0
-    duration_s: Positive
+    north_m_s: LegVelocity = 0.0
+    east_m_s: LegVelocity = 0.0
+    up_m_s: LegVelocity = 0.0
+    duration_s: Annotated[float, Field(gt=0, le=DURATION_MAX_S, allow_inf_nan=False)]
 
 
 class TurnLegTable(_Table):
     kind: Literal["turn"]
-    rate_deg_s: Annotated[float, Field(ge=-60, le=60, allow_inf_nan=False)]
+    rate_deg_s: Annotated[float, Field(ge=-TURN_RATE_MAX_DEG_S, le=TURN_RATE_MAX_DEG_S, allow_inf_nan=False)]
     """positive turns right"""
-    angle_deg: Annotated[float, Field(gt=0, le=36000, allow_inf_nan=False)] | None = None
+    angle_deg: Annotated[float, Field(ge=TURN_ANGLE_MIN_DEG, le=TURN_ANGLE_MAX_DEG, allow_inf_nan=False)] | None = None
     """None circles for ever"""
 
 
 class GotoLegTable(_Table):
     kind: Literal["goto"]
-    north_m: Real
-    east_m: Real
+    north_m: Annotated[float, Field(ge=-PLACE_MAX_M, le=PLACE_MAX_M, allow_inf_nan=False)]
+    east_m: Annotated[float, Field(ge=-PLACE_MAX_M, le=PLACE_MAX_M, allow_inf_nan=False)]
     altitude_m: Annotated[float, Field(ge=1, le=500, allow_inf_nan=False)] | None = None
-    speed_m_s: Annotated[float, Field(ge=0.1, le=12, allow_inf_nan=False)] = 1.0
+    speed_m_s: Annotated[float, Field(ge=0.1, le=VELOCITY_MAX_M_S, allow_inf_nan=False)] = 1.0
+    """greatest speed of the centre; less where the vertical limits or a short way ask for it"""
 
 
 LegTable = Annotated[HoldLegTable | VelocityLegTable | TurnLegTable | GotoLegTable, Field(discriminator="kind")]
@@ -138,7 +152,7 @@ LegTable = Annotated[HoldLegTable | VelocityLegTable | TurnLegTable | GotoLegTab
 class PlanTable(_Table):
     """How the formation moves once all have formed."""
 
-    legs: tuple[LegTable, ...] = ()
+    legs: Annotated[tuple[LegTable, ...], Field(max_length=LEGS_MAX)] = ()
     heading: Literal["fixed", "track"] = "fixed"
     """track: the formation's heading follows turns"""
     then: Then = "stay"
@@ -436,6 +450,36 @@ class FleetConfig(_Table):
         return PLAN_SPEED_SHARE * self.limits.speed_max_m_s / 2
 
     @property
+    def motion_limits(self) -> MotionLimits:
+        """What every motion must keep, whoever proposes it."""
+        x = self.limits
+        # Slots that change places by the assignment stay 1/sqrt(2) of their distance apart (`formation.assign`): with
+        # the offsets u before and w after of a pair u.w >= 0, since exchanging the two would else cost less.
+        apart_m = self.safety_radius_m / sqrt(2.0) if x.barrier else 0.0
+        return MotionLimits(x.speed_max_m_s, x.climb_max_m_s, x.descent_max_m_s, apart_m, self.geofence)
+
+    def motion_into(self, shape: str, motion: Motion, at_ns: int, issuer: int) -> Motion:
+        """The motion that takes over from `motion` with another formation.
+
+        The slots use what speed the centre leaves them, half of the limit at most.
+        """
+        x = self.limits
+        left = x.speed_max_m_s - top_speed_m_s(motion)
+        return with_formation(
+            motion, at_ns=at_ns, issuer=issuer, shape=shape, slots=self.slots(shape), pinned=self.pinned,
+            speed_m_s=max(min(left, x.speed_max_m_s / 2), (1.0 - PLAN_SPEED_SHARE) * x.speed_max_m_s),
+            climb_m_s=x.climb_max_m_s / 4, descent_m_s=x.descent_max_m_s / 4,
+        )  # fmt: skip
+
+    def motion_home(self, motion: Motion, at_ns: int, issuer: int) -> Motion:
+        """The motion that takes over from `motion` and brings every vehicle back over its own pad, to land."""
+        share = PLAN_SPEED_SHARE / 2
+        return with_return(
+            motion, self.first_motion, at_ns=at_ns, issuer=issuer, speed_m_s=self.return_speed_m_s,
+            climb_m_s=share * self.limits.climb_max_m_s, descent_m_s=share * self.limits.descent_max_m_s,
+        )  # fmt: skip
+
+    @property
     def peer_limits(self) -> PeerLimits:
         return PeerLimits(
             hold=self.law.hold,
@@ -538,37 +582,41 @@ class FleetConfig(_Table):
             legs=(),
         )
 
-    def plan_legs(self, start: Ned) -> tuple[Leg, ...]:
-        """The plan's legs, begun at `start` (the centre, m)."""
-        return tuple(legs_from(self.plan.legs, start))
+    def plan_legs(self, start: Ned, velocity: Ned = ZERO) -> tuple[Leg, ...]:
+        """The plan's legs, begun at `start` with `velocity` (the centre's, m and m/s)."""
+        return tuple(self._legs(self.plan.legs, start, velocity))
+
+    def waypoint(self, start: Ned, velocity: Ned, table: GotoLegTable) -> Leg:
+        """The leg to a waypoint from a place and a velocity of the centre, within the vertical limits."""
+        x = self.limits
+        down = start.down if table.altitude_m is None else -table.altitude_m
+        return goto_leg(
+            start, velocity, Ned(table.north_m, table.east_m, down), table.speed_m_s,
+            PLAN_SPEED_SHARE * x.climb_max_m_s, PLAN_SPEED_SHARE * x.descent_max_m_s,
+        )  # fmt: skip
+
+    def _legs(self, tables: Sequence[LegTable], place: Ned, velocity: Ned) -> Iterator[Leg]:
+        """Legs of the core from their tables; how long a waypoint takes follows from where the leg before has led."""
+        for table in tables:
+            leg: Leg
+            match table:
+                case HoldLegTable():
+                    leg = VelocityLeg(ZERO, table.duration_s)
+                case VelocityLegTable():
+                    leg = VelocityLeg(Ned(table.north_m_s, table.east_m_s, -table.up_m_s), table.duration_s)
+                case TurnLegTable():
+                    angle = inf if table.angle_deg is None else radians(table.angle_deg)
+                    leg = TurnLeg(radians(table.rate_deg_s), angle)
+                case GotoLegTable():
+                    leg = self.waypoint(place, velocity, table)
+            yield leg
+            _, place, velocity, _ = leg_end(leg, place, velocity)
 
     @cached_property
     def shared_hash(self) -> str:
         """Digest of what the vehicles must agree on: everything but links and the stubs' noise."""
         shared = self.model_dump(exclude={"stub": True, "vehicle": {"__all__": {"mavlink", "zenoh"}}})
         return blake2s(json.dumps(shared, sort_keys=True).encode(), digest_size=8).hexdigest()
-
-
-def legs_from(tables: Sequence[LegTable], start: Ned) -> Iterator[Leg]:
-    """Legs of the core from their tables; a waypoint's duration follows from its distance."""
-    place = start
-    for table in tables:
-        match table:
-            case HoldLegTable():
-                yield VelocityLeg(ZERO, table.duration_s)
-            case VelocityLegTable():
-                velocity = Ned(table.north_m_s, table.east_m_s, -table.up_m_s)
-                yield VelocityLeg(velocity, table.duration_s)
-                place = Ned(*(p + v * table.duration_s for p, v in zip(place, velocity, strict=True)))
-            case TurnLegTable():
-                angle = inf if table.angle_deg is None else radians(table.angle_deg)
-                yield TurnLeg(radians(table.rate_deg_s), angle)
-            case GotoLegTable():
-                down = place.down if table.altitude_m is None else -table.altitude_m
-                target = Ned(table.north_m, table.east_m, down)
-                way = sqrt(sum((a - b) ** 2 for a, b in zip(place, target, strict=True)))
-                yield GotoLeg(target, goto_duration_s(way, table.speed_m_s))
-                place = target
 
 
 def companion_port(instance: int) -> int:
@@ -639,7 +687,7 @@ def parse(tables: Mapping[str, Any], name: str) -> FleetConfig:
         except ConfigError as error:
             faults.append(str(error))
         else:
-            faults += _outside_faults(config)
+            faults += _motion_faults(config)
     if faults:
         raise ConfigError("\n".join(f"{name}: {fault}" for fault in faults))
     return config
@@ -692,9 +740,8 @@ def _faults(config: FleetConfig) -> Iterator[str]:
 
 
 def _plan_faults(config: FleetConfig) -> Iterator[str]:
-    """Legs that ask for more than the limits leave, or lead into the ground."""
+    """Legs that ask for more than the limits leave; what follows from the legs before is `_motion_faults`."""
     limits = config.limits
-    altitude_m = config.formation.altitude_m
     level = PLAN_SPEED_SHARE * limits.speed_max_m_s
     for k, leg in enumerate(config.plan.legs):
         where = f"$.plan.legs[{k}]"
@@ -709,9 +756,6 @@ def _plan_faults(config: FleetConfig) -> Iterator[str]:
                         f"{where}.up_m_s must be >= {least:g} and <= {most:g} m/s "
                         f"(3/4 of $.limits.descent_max_m_s and climb_max_m_s), got {leg.up_m_s:g}"
                     )
-                altitude_m += leg.up_m_s * leg.duration_s
-                if altitude_m < ALTITUDE_MIN_M:
-                    yield f"{where}: must end at least {ALTITUDE_MIN_M:g} m above the origin, got {altitude_m:g}"
             case TurnLegTable():
                 if abs(leg.rate_deg_s) < TURN_RATE_MIN_DEG_S:
                     yield f"{where}.rate_deg_s must be {TURN_RATE_MIN_DEG_S:g} deg/s or more, got {leg.rate_deg_s:g}"
@@ -723,7 +767,6 @@ def _plan_faults(config: FleetConfig) -> Iterator[str]:
                         f"{where}.speed_m_s must be <= {level:g} m/s (3/4 of $.limits.speed_max_m_s), "
                         f"got {leg.speed_m_s:g}"
                     )
-                altitude_m = altitude_m if leg.altitude_m is None else leg.altitude_m
     last = config.plan.legs[-1] if config.plan.legs else None
     if isinstance(last, VelocityLegTable) and last.up_m_s != 0.0 and config.plan.then == "stay":
         yield f"$.plan.legs[{len(config.plan.legs) - 1}].up_m_s must be 0 m/s in the last leg: it goes on for ever"
@@ -764,11 +807,46 @@ def _fence_faults(fence: FenceTable) -> Iterator[str]:
         yield f"$.fence.polygon_m must be wider than twice $.fence.margin_m = {fence.margin_m:g} m, got nothing inside"
 
 
-def _outside_faults(config: FleetConfig) -> Iterator[str]:
-    """Pads, formation and plan that are not inside the fence."""
+def _motion_faults(config: FleetConfig) -> Iterator[str]:
+    """Pads that are not inside the fence, and motions that the vehicles would refuse of each other: the way into the
+    formation, the plan, the way back."""
     fence = config.geofence
-    if fence is None:
+    if fence is not None:
+        yield from _pad_faults(config, fence)
+    if fence is not None and fence.vertical_room_m(-config.formation.altitude_m) < 0.0:
+        yield (
+            f"$.formation.altitude_m must be >= {-fence.lowest_down_m:g} and <= {-fence.highest_down_m:g} m "
+            f"(between floor and ceiling of the fence, less $.fence.vertical_margin_m), "
+            f"got {config.formation.altitude_m:g}"
+        )
         return
+    limits, first = config.motion_limits, config.first_motion
+    formed = config.motion_into(config.formation.shape, first, 0, 0)
+    fault = examine(formed, limits, first).fault
+    if fault is not None:
+        yield _formation_sentence(fault)
+        return
+    planned, start_ns = formed, formed.blend_end_ns
+    if config.plan.legs:
+        now = formed.moment(start_ns).centre
+        legs = config.plan_legs(now.position, now.velocity)
+        planned = with_legs(formed, at_ns=start_ns, issuer=0, legs=legs, then=config.plan.then)
+        fault = examine(planned, limits, formed).fault
+        if fault is not None:
+            yield _plan_sentence(fault)
+            return
+    if config.plan.then == "return" and planned.end_ns is not None:
+        fault = examine(config.motion_home(planned, planned.end_ns, 0), limits, planned).fault
+        if fault is not None and fault.breach is not None:
+            yield (
+                f'$.plan.then = "return": the way back from the last leg must stay inside the fence by its margin, '
+                f"got vehicle {fault.breach.vehicle_id} {fault.breach.outside_m:.2f} m beyond it"
+            )
+        elif fault is not None:
+            yield f'$.plan.then = "return": the way back from the last leg would be refused: {fault.sentence}'
+
+
+def _pad_faults(config: FleetConfig, fence: Fence) -> Iterator[str]:
     for v in config.vehicles:
         room = fence.edge_room_m(v.pad_north_m, v.pad_east_m)
         if room < 0.0:
@@ -776,45 +854,25 @@ def _outside_faults(config: FleetConfig) -> Iterator[str]:
                 f"$.vehicle[{v.instance}].pad_m must be inside the fence by $.fence.margin_m = {fence.margin_m:g} m, "
                 f"got [{v.pad_north_m:g}, {v.pad_east_m:g}], {-room:.2f} m too far out"
             )
-    if fence.vertical_room_m(-config.formation.altitude_m) < 0.0:
-        yield (
-            f"$.formation.altitude_m must be >= {-fence.lowest_down_m:g} and <= {-fence.highest_down_m:g} m "
-            f"(between floor and ceiling of the fence, less $.fence.vertical_margin_m), "
-            f"got {config.formation.altitude_m:g}"
-        )
-        return
-    formed = with_formation(
-        config.first_motion, at_ns=0, issuer=0, shape=config.formation.shape,
-        slots=config.slots(config.formation.shape), pinned=config.pinned,
-        speed_m_s=config.limits.speed_max_m_s / 2,
-    )  # fmt: skip
-    breach = first_breach(formed, fence)
-    if breach is not None:
-        yield (
-            f"$.formation: the slot of vehicle {breach.vehicle_id} must be inside the fence by its margin, "
-            f"got {breach.outside_m:.2f} m beyond it"
-        )
-        return
-    start_ns = formed.blend_end_ns
-    legs = config.plan_legs(formed.moment(start_ns).centre.position)
-    planned = with_legs(formed, at_ns=start_ns, issuer=0, legs=legs, then=config.plan.then)
-    breach = first_breach(planned, fence)
-    if breach is not None:
-        yield (
-            f"$.plan.legs[{breach.leg}] must stay inside the fence by its margin, "
-            f"got vehicle {breach.vehicle_id} {breach.outside_m:.2f} m beyond it {breach.time_s:.1f} s into the plan"
-        )
-        return
-    if config.plan.then == "return" and planned.end_ns is not None:
-        back = with_return(
-            planned, config.first_motion, at_ns=planned.end_ns, issuer=0, speed_m_s=config.return_speed_m_s
-        )
-        breach = first_breach(back, fence)
-        if breach is not None:
-            yield (
-                f'$.plan.then = "return": the way back from the last leg must stay inside the fence by its margin, '
-                f"got vehicle {breach.vehicle_id} {breach.outside_m:.2f} m beyond it"
-            )
+
+
+def _formation_sentence(fault: Fault) -> str:
+    if fault.breach is None:
+        return f"$.formation: the way into it would be refused: {fault.sentence}"
+    return (
+        f"$.formation: the slot of vehicle {fault.breach.vehicle_id} must be inside the fence by its margin, "
+        f"got {fault.breach.outside_m:.2f} m beyond it"
+    )
+
+
+def _plan_sentence(fault: Fault) -> str:
+    where = "$.plan" if fault.leg is None else f"$.plan.legs[{fault.leg}]"
+    if fault.breach is None or fault.breach.vehicle_id == 0:
+        return f"{where} would be refused: {fault.sentence.removeprefix(f'its leg {fault.leg} ')}"
+    return (
+        f"{where} must stay inside the fence by its margin, got vehicle {fault.breach.vehicle_id} "
+        f"{fault.breach.outside_m:.2f} m beyond it {fault.breach.time_s:.1f} s into the plan"
+    )
 
 
 _UNITS = {

@@ -94,6 +94,33 @@ class Fence:
         distance = min(foot[0] for foot in self._feet(north, east))
         return distance if self._within(north, east) else -distance
 
+    @cached_property
+    def convex(self) -> bool:
+        """Whether the straight way between two places inside is inside: of a cylinder, and of a polygon without notch.
+
+        Only then is the least room on a straight way that at one of its ends.
+        """
+        edges = self._edges
+        return all(a[2] * b[3] - a[3] * b[2] >= -1e-12 for a, b in zip(edges, (*edges[1:], *edges[:1]), strict=True))
+
+    def edge_room_along_m(self, a_north: float, a_east: float, b_north: float, b_east: float) -> float:
+        """Least room to the edge's margin on the straight way from a to b; where the way crosses the edge, no more than
+        minus the margin."""
+        ends = min(self.edge_room_m(a_north, a_east), self.edge_room_m(b_north, b_east))
+        if self.convex or ends < 0.0:
+            return ends
+        way_north, way_east = b_north - a_north, b_east - a_east
+        for c_north, c_east, d_north, d_east, length in self._edges:
+            # Where the way passes the edge's line, and the edge the way's line.
+            across = way_north * d_east - way_east * d_north
+            x, y = c_north - a_north, c_east - a_east
+            if across != 0.0:
+                share, along = (x * d_east - y * d_north) / across, (x * way_east - y * way_north) / across
+                if 0.0 <= share <= 1.0 and 0.0 <= along <= length:
+                    return -self.margin_m
+            ends = min(ends, _distance(x, y, way_north, way_east) - self.margin_m)
+        return ends
+
     def clearance_m(self, position_ned_m: Ned) -> float:
         """Distance to the nearest of edge, floor and ceiling; negative outside."""
         altitude = -position_ned_m.down
@@ -156,6 +183,13 @@ class Fence:
         n_north, n_east = (-x / r, -y / r) if r > 1e-9 else (-1.0, 0.0)
         # The bend of the distance grows without bound toward the centre, where no wall is near.
         return Wall(kept - r, n_north, n_east, -1.0 / max(r, 0.5 * kept))
+
+
+def _distance(x: float, y: float, way_north: float, way_east: float) -> float:
+    """Of the point (x, y) from the straight way that leads from the origin to (way_north, way_east)."""
+    length2 = way_north * way_north + way_east * way_east
+    share = min(max((x * way_north + y * way_east) / length2, 0.0), 1.0) if length2 > 0.0 else 0.0
+    return hypot(x - share * way_north, y - share * way_east)
 
 
 def braking_pole_per_s(speed_max_m_s: float, avoidance_acceleration_m_s2: float) -> float:
