@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from companion.agent import Agent, Outputs
+from companion.border import Border
 from companion.config import STALE_AFTER, FleetConfig
 from companion.core.failsafe import CONFIGURATION_S, Failsafe
 from companion.core.values import Instant
@@ -42,6 +43,8 @@ TRAFFIC_RECORD = struct.Struct("<q")
 """body of the "traffic" channel: bytes that this process's TCP connections have sent so far"""
 LANDING_GRACE_S = 3.0
 """how long an ending companion waits for its autopilot to confirm landing"""
+LOST = 4
+"""exit status of a companion whose control ticks do nothing but raise"""
 ABANDONED_GRACE_S = 1.0
 """the same when whoever launched it is gone"""
 
@@ -94,6 +97,7 @@ class Companion:
         self.settings = settings
         self.boot_id = secrets.randbits(32)
         self.agent = Agent(config, settings.vehicle_id, self.boot_id)
+        self.border = Border(self.agent)
         self.clock = FleetClock()
         self._wake_read, self._wake_write = socket.socketpair()
         self._wake_read.setblocking(False)
@@ -150,7 +154,7 @@ class Companion:
             self._noticed.add(failsafe)
             now = self._instant(now_ns)
             self._record("input/notice", now, failsafe.name.encode())
-            self.agent.notice(failsafe, now)
+            self.border.notice(failsafe, now)
 
     def close(self) -> None:
         """Release everything, the Zenoh session first."""
@@ -162,13 +166,16 @@ class Companion:
         stop_by_ns = now.monotonic_ns + round(grace_s * 1e9)
         if self._stop_by_ns is None:
             self._record("input/stop", now, b"")
-            self.agent.stop(now)
+            self.border.stop(now)
             self._stop_by_ns = stop_by_ns
             self._notifier.stopping()
         self._stop_by_ns = min(self._stop_by_ns, stop_by_ns)
 
     def run(self) -> int:
-        """Run until stopped; 0 if the vehicle was safe then, 3 if it still flew without a confirmed landing."""
+        """Run until stopped; 0 if the vehicle was safe then, 3 if it still flew without a confirmed landing.
+
+        4 at once if control ticks do nothing but raise (`border`): the autopilot's failsafe has the vehicle then.
+        """
         asked: list[bool] = []
         waiting: list[Any] = [self.link, self._wake_read]
         if self.settings.stop_fd is not None:
@@ -184,7 +191,7 @@ class Companion:
         with _signals(ask):
             self._notifier.ready()
             while True:
-                deadline_ns = min(self.agent.next_deadline_ns(), self._second_ns)
+                deadline_ns = min(self.border.next_deadline_ns(), self._second_ns)
                 ready, _, _ = select.select(waiting, [], [], max(deadline_ns - time.monotonic_ns(), 0) * 1e-9)
                 requests = self._receive(ready)
                 if asked:
@@ -198,6 +205,9 @@ class Companion:
                 for request in requests:
                     self._reply(request)
                 now_ns = time.monotonic_ns()
+                self._tell_raised(now_ns)
+                if self.border.lost(now_ns):
+                    return LOST
                 if now_ns >= self._second_ns:
                     self._each_second(now_ns)
                 if self._stop_by_ns is not None and (self.agent.stopped or now_ns >= self._stop_by_ns):
@@ -219,7 +229,7 @@ class Companion:
                     continue
                 now = self._instant(received_ns)
                 self._record("input/mavlink", now, datagram)
-                if self.agent.receive_mavlink(datagram, now):
+                if self.border.receive_mavlink(datagram, now):
                     self.link.confirm(address, received_ns)
                 if self._driver_ns is None and self.agent.next_deadline_ns() == 0:
                     self._driver_ns = received_ns
@@ -231,20 +241,20 @@ class Companion:
             match event:
                 case PeerMessage():
                     self._record("input/peer", now, event.key.encode() + b"\0" + event.payload)
-                    self.agent.receive_peer(event.key, event.payload, now)
+                    self.border.receive_peer(event.key, event.payload, now)
                 case PresenceChange():
                     self._record("input/presence", now, bytes((event.vehicle_id, event.alive)))
-                    self.agent.receive_presence(event.vehicle_id, event.alive, now)
+                    self.border.receive_presence(event.vehicle_id, event.alive, now)
                 case Request():
                     requests.append(event)
         return requests
 
     def _advance(self, deadline_ns: int) -> None:
-        if self.agent.next_deadline_ns() > time.monotonic_ns():
+        if self.border.next_deadline_ns() > time.monotonic_ns():
             return
         now = self._instant(time.monotonic_ns())
         self._record("advance", now, b"")
-        out = self.agent.advance(now)
+        out = self.border.advance(now)
         for datagram in out.mavlink:
             self.link.send(datagram)
         sent_ns = time.monotonic_ns()
@@ -252,6 +262,14 @@ class Companion:
             self.network.publish(topic, payload)
         self._notifier.turned(sent_ns)
         self._after(out, now, sent_ns, deadline_ns)
+
+    def _tell_raised(self, now_ns: int) -> None:
+        """Log and record what was raised for the first time."""
+        notes, self.border.notes = self.border.notes, []
+        for note in notes:
+            self._record("note", self._instant(now_ns), f"raised: {note}".encode())
+            with suppress(OSError):
+                self.settings.log(f"raised: {note}")
 
     def _after(self, out: Outputs, now: Instant, sent_ns: int, deadline_ns: int) -> None:
         for datagram in out.mavlink:
@@ -276,11 +294,16 @@ class Companion:
         now = self._instant(time.monotonic_ns())
         if request.kind == "command":
             self._record("input/command", now, request.payload)
-            request.reply(self.agent.receive_command(request.payload, now))
+            request.reply(self.border.receive_command(request.payload, now))
             return
         if request.kind == "preflight":
-            request.reply(self._preflight(request, now))
-            return
+            answer = self.border.reply("preflight", lambda: self._preflight(request, now))
+        else:
+            answer = self.border.reply("status", lambda: self._status(now))
+        if answer is not None:
+            request.reply(answer)
+
+    def _status(self, now: Instant) -> bytes:
         status = self.agent.status(now)
         counters = self.network.counters
         status["lateness_ms"] = self.lateness_ns * 1e-6
@@ -293,7 +316,8 @@ class Companion:
             "peer: under our own id": counters.own_id_heard,
         }
         status["rejected"] |= {kind: count for kind, count in elsewhere.items() if count}
-        request.reply(json.dumps(status).encode())
+        status["rejected"] |= {f"raised: {kind}": count for kind, count in self.border.raised.items()}
+        return json.dumps(status).encode()
 
     def _preflight(self, request: Request, now: Instant) -> bytes:
         if request.payload == b"clock":
