@@ -106,6 +106,15 @@ class Fence:
     def edge_room_along_m(self, a_north: float, a_east: float, b_north: float, b_east: float) -> float:
         """Least room to the edge's margin on the straight way from a to b; where the way crosses the edge, no more than
         minus the margin."""
+        if self._edges and self.convex:
+            # Inside, the nearest edge is that whose line is nearest; outside, the line is no further than the edge.
+            least = inf
+            for c_north, c_east, d_north, d_east, _ in self._edges:
+                a = (a_east - c_east) * d_north - (a_north - c_north) * d_east
+                b = (b_east - c_east) * d_north - (b_north - c_north) * d_east
+                least = min(least, a, b)
+            if least >= 0.0:
+                return least - self.margin_m
         ends = min(self.edge_room_m(a_north, a_east), self.edge_room_m(b_north, b_east))
         if self.convex or ends < 0.0:
             return ends

@@ -33,10 +33,10 @@ from companion.core.values import ZERO
 
 RESOLUTION_M = 0.01
 """a breach between two looks that is no deeper than this may be missed"""
-LOOKS_MAX = 1200
-"""most looks at a motion; a look at every slot counts SLOT_LOOKS, and each edge of a polygon as much again"""
-SLOT_LOOKS = 0.25
-"""cost of one slot's place over that of a look at the centre"""
+LOOKS_MAX = 1400
+"""most looks at a motion of up to ten vehicles; of more vehicles more, up to three times as many"""
+SLOT_LOOKS, EDGE_LOOKS = 0.25, 0.4
+"""cost of one slot's place over that of a look at the centre, and of one edge of a polygon over that of the place"""
 DEPTH_PARTS = 24
 """a leg that leads outside is looked at in so many parts, and its worst part again, to tell how far it leads"""
 TOLERANCE_M = 1e-6
@@ -70,6 +70,8 @@ class _Span(NamedTuple):
     end_ns: int
     centre_m_s2: float
     """no greater is the centre's acceleration"""
+    straight: bool
+    """whether the centre's way is straight, without turning back, at whatever pace"""
     rate_rad_s: float
     """nor the heading's rate"""
     rate_change_rad_s2: float
@@ -82,17 +84,17 @@ def _leg_spans(motion: Motion, k: int, since_ns: int) -> Iterator[_Span]:
     match leg:
         case VelocityLeg():
             ramp_ns = since_ns + round(velocity_ramp_s(leg, v) * 1e9)
-            yield _Span(k, since_ns, ramp_ns, PLAN_ACCELERATION_M_S2, 0.0, 0.0)
+            yield _Span(k, since_ns, ramp_ns, PLAN_ACCELERATION_M_S2, _aligned(v, leg.velocity_ned_m_s), 0.0, 0.0)
             if duration < inf:
-                yield _Span(k, ramp_ns, since_ns + round(duration * 1e9), 0.0, 0.0, 0.0)
+                yield _Span(k, ramp_ns, since_ns + round(duration * 1e9), 0.0, True, 0.0, 0.0)
         case GotoLeg():
             bend = MINIMUM_JERK_BEND * dist(p, leg.target_ned_m) / duration**2 + 4.0 * hypot(*v) / duration
-            yield _Span(k, since_ns, since_ns + round(duration * 1e9), bend, 0.0, 0.0)
+            yield _Span(k, since_ns, since_ns + round(duration * 1e9), bend, v == ZERO, 0.0, 0.0)
         case TurnLeg():
             rate = abs(turn_rate_and_time(leg)[0])
             turning = rate if motion.heading_follows_turns else 0.0
-            ramp = (rate * hypot(v.north, v.east), turning, 1.5 * turning / TURN_RAMP_S)
-            steady = (*ramp[:2], 0.0)
+            ramp = (rate * hypot(v.north, v.east), False, turning, 1.5 * turning / TURN_RAMP_S)
+            steady = (*ramp[:3], 0.0)
             from_ns, once_ns = since_ns + round(TURN_RAMP_S * 1e9), round(2.0 * pi / rate * 1e9)
             yield _Span(k, since_ns, from_ns, *ramp)
             # Of many turns the first and the last: those between are the same circle, once the slots are there.
@@ -117,14 +119,24 @@ def _spans(motion: Motion) -> Iterator[_Span]:
             return
         since_ns = motion.legs_start_ns + round(since * 1e9)
         if k == 0 and since_ns > now_ns:
-            yield _Span(None, now_ns, since_ns, 0.0, 0.0, 0.0)
+            yield _Span(None, now_ns, since_ns, 0.0, True, 0.0, 0.0)
         if k == len(motion.legs):
             now_ns = max(since_ns, motion.start_ns)
             break
         for span in _leg_spans(motion, k, since_ns):
             if span.end_ns >= motion.start_ns:
                 yield span._replace(start_ns=max(span.start_ns, motion.start_ns))
-    yield _Span(None, now_ns, max(motion.blend_end_ns, now_ns), 0.0, 0.0, 0.0)
+    yield _Span(None, now_ns, max(motion.blend_end_ns, now_ns), 0.0, True, 0.0, 0.0)
+
+
+def _aligned(a: Ned, b: Ned) -> bool:
+    """Whether two velocities have one direction, or one of them is none."""
+    across = (
+        a.north * b.east - a.east * b.north,
+        a.east * b.down - a.down * b.east,
+        a.down * b.north - a.north * b.down,
+    )
+    return across == (0.0, 0.0, 0.0) and a.north * b.north + a.east * b.east + a.down * b.down >= 0.0
 
 
 @dataclass(slots=True)
@@ -142,6 +154,7 @@ class _March:
     _most_down_m: float = field(init=False)
     _way_m: float = field(init=False)
     """the longest way of a change"""
+    _looks_max: float = field(init=False)
     _centre_cost: float = field(init=False)
     _slots_cost: float = field(init=False)
 
@@ -150,9 +163,15 @@ class _March:
         self._level_m = max(hypot(s.north, s.east) for s in ends)
         self._least_down_m, self._most_down_m = min(s.down for s in ends), max(s.down for s in ends)
         self._way_m = max(dist(*change) for change in self.motion.slots.values())
-        edges = len(self.fence.corners_m)
-        self._centre_cost = 1.0 + SLOT_LOOKS * edges
-        self._slots_cost = SLOT_LOOKS * len(self.motion.slots) * (1.0 + edges)
+        edges, count = len(self.fence.corners_m), len(self.motion.slots)
+        self._looks_max = LOOKS_MAX * min(max(count / 10.0, 1.0), 3.0)
+        self._centre_cost = 1.0 + SLOT_LOOKS * EDGE_LOOKS * edges
+        self._slots_cost = SLOT_LOOKS * count * (1.0 + EDGE_LOOKS * edges)
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether the looks are used up."""
+        return self.looks > self._looks_max
 
     def least_room(self, fleet_ns: int) -> tuple[float, int]:
         """Least room of any slot at a time, and the vehicle that has it."""
@@ -166,16 +185,17 @@ class _March:
         return least, vehicle
 
     def _bend_m_s2(self, span: _Span, start_ns: int, end_ns: int) -> float:
-        """No slot's acceleration is greater between two times of a span."""
-        m, bend = self.motion, span.centre_m_s2
+        """No slot's acceleration is greater between two times of a span; 0 where all ways are straight."""
+        m, bend = self.motion, 0.0
         rate, change = span.rate_rad_s, span.rate_change_rad_s2
         if m.heading_rate_rad_s != 0.0 and start_ns - m.legs_start_ns < TURN_RAMP_S * 1e9:
             rate += abs(m.heading_rate_rad_s)
             change += 1.5 * abs(m.heading_rate_rad_s) / TURN_RAMP_S
-        bend += (change + rate * rate) * self._level_m
+        bend = (change + rate * rate) * self._level_m
         if m.blend_s > 0.0 and start_ns < m.blend_end_ns and end_ns > m.blend_start_ns:
             bend += (2.0 * rate * 1.875 / m.blend_s + MINIMUM_JERK_BEND / m.blend_s**2) * self._way_m
-        return bend
+        # Slots that are rigidly about a centre on a straight way fly straight; others do not, at an uneven pace.
+        return 0.0 if bend == 0.0 and span.straight else bend + span.centre_m_s2
 
     def inside(self, span: _Span) -> bool:
         """Whether every slot stays inside over a span; also False once the looks are used up."""
@@ -184,16 +204,16 @@ class _March:
         while stack:
             start_ns, first, end_ns, last = stack.pop()
             self.looks += self._centre_cost
-            if self.looks > LOOKS_MAX:
+            if self.exhausted:
                 return False
             seconds = (end_ns - start_ns) * 1e-9
             strip = 0.125 * self._bend_m_s2(span, start_ns, end_ns) * seconds * seconds
             if self._all_inside(first, last, strip):
                 continue
-            least, ends, wide = self._slots_inside(first, last, strip)
+            least, wide = self._slots_inside(first, last, strip)
             if least >= self.allowed_m:
                 continue
-            if ends < self.allowed_m:
+            if not self._ends_inside(first, last):
                 return False
             middle_ns = (start_ns + end_ns) // 2
             if wide > RESOLUTION_M and start_ns < middle_ns < end_ns:
@@ -213,20 +233,29 @@ class _March:
             and fence.edge_room_along_m(a.north, a.east, b.north, b.east) - self._level_m >= need
         )  # fmt: skip
 
-    def _slots_inside(self, first: Moment, last: Moment, strip: float) -> tuple[float, float, float]:
-        """Least room of the strips about the slots' ways, that at their ends, and how wide or (beside a notch) how long
-        what may be halved is."""
+    def _slots_inside(self, first: Moment, last: Moment, strip: float) -> tuple[float, float]:
+        """Least room of the strips about the slots' ways, and how wide or (beside a notch) how long what may be halved
+        is."""
         self.looks += 2.0 * self._slots_cost
         fence, convex = self.fence, self.fence.convex
-        along = ends = inf
-        wide = strip
+        least, wide = inf, strip
         for change in self.motion.slots.values():
             a, b = first.slot(change).position_ned_m, last.slot(change).position_ned_m
-            ends = min(ends, fence.room_m(a), fence.room_m(b))
+            least = min(
+                least, fence.vertical_room_m(a.down), fence.vertical_room_m(b.down),
+                fence.edge_room_along_m(a.north, a.east, b.north, b.east),
+            )  # fmt: skip
             if not convex:
-                along = min(along, fence.edge_room_along_m(a.north, a.east, b.north, b.east))
                 wide = max(wide, hypot(b.north - a.north, b.east - a.east))
-        return min(along, ends) - strip, ends, wide
+        return least - strip, wide
+
+    def _ends_inside(self, first: Moment, last: Moment) -> bool:
+        self.looks += self._slots_cost
+        return all(
+            self.fence.room_m(moment.slot(change).position_ned_m) >= self.allowed_m
+            for change in self.motion.slots.values()
+            for moment in (first, last)
+        )
 
     def deepest(self, spans: list[_Span]) -> Breach | None:
         """How far the spans of one leg lead outside at most."""
@@ -269,7 +298,7 @@ def examined(motion: Motion, fence: Fence) -> tuple[Breach | None, float]:
     for span in spans:
         if march.inside(span):
             continue
-        if march.looks > LOOKS_MAX:
+        if march.exhausted:
             return Breach(span.leg, 0, 0.0, (span.start_ns - motion.start_ns) * 1e-9), march.looks
         return march.deepest([s for s in spans if s.leg == span.leg]), march.looks
     return None, march.looks
