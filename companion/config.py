@@ -66,6 +66,10 @@ Real = Annotated[float, Field(ge=-1e5, le=1e5, allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, le=1e5, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, le=1e5, allow_inf_nan=False)]
 Gain = Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)]
+Noise = Annotated[float, Field(ge=0, le=5, allow_inf_nan=False)]
+"""standard deviation that an estimator, or the air, is assumed to have; with more nobody flies in formation"""
+Wait = Annotated[float, Field(ge=1, le=3600, allow_inf_nan=False)]
+"""a time for which a vehicle waits: a second at least, since the exchange takes some; no longer than batteries last"""
 Percent = Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)]
 VehicleId = Annotated[int, Field(ge=1, le=250)]
 
@@ -166,13 +170,15 @@ class LawTable(_Table):
 
     kind: Literal["starling", "paper"] = "starling"
     hold: HoldKind = "damped"
-    hold_damping_s: Positive = 0.7
+    hold_damping_s: Annotated[float, Field(ge=0.05, le=10, allow_inf_nan=False)] = 0.7
+    """shorter, a prediction forgets velocity within a tick or two; longer, it runs away with it"""
     k_s: Gain = 3.0
     k_a: Gain = 3.0
     k_c: Gain = 4.0
     k_v: Gain = 1.0
     k_p: Gain = 0.3
-    a_max_m_s2: Annotated[float, Field(gt=0, le=20, allow_inf_nan=False)] = 5.0
+    a_max_m_s2: Annotated[float, Field(ge=2, le=20, allow_inf_nan=False)] = 5.0
+    """at least twice what plans ask for (1 m/s^2): the rest keeps the formation against gusts"""
     r0_m: Annotated[float, Field(ge=0.1, le=1000, allow_inf_nan=False)] | None = None
     """range of separation; None: half the spacing"""
 
@@ -181,11 +187,15 @@ class TriggerTable(_Table):
     """When to tell the peers."""
 
     kind: TriggerKind = "error"
-    epsilon_m: Positive = 0.3
-    gamma_s2: Positive = 0.1
-    kappa: NotNegative = 0.3
-    t_min_s: NotNegative = 0.05
-    t_max_s: Annotated[float, Field(gt=0, le=60, allow_inf_nan=False)] = 10.0
+    epsilon_m: Annotated[float, Field(ge=0.01, le=5, allow_inf_nan=False)] = 0.3
+    """below a centimetre every tick is an event; the safety radius grows with it"""
+    gamma_s2: Annotated[float, Field(ge=1e-4, le=100, allow_inf_nan=False)] = 0.1
+    """an error of velocity counts as an error of place sqrt(gamma) seconds later"""
+    kappa: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)] = 0.3
+    t_min_s: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)] = 0.05
+    """longer, an event would wait for longer than the safety radius allows for"""
+    t_max_s: Annotated[float, Field(ge=0.5, le=60, allow_inf_nan=False)] = 10.0
+    """shorter, a peer would be stale between two of its ticks"""
     period_s: Positive = 0.05
     """of kind "periodic" """
     alpha: NotNegative = 0.1
@@ -199,15 +209,18 @@ class LimitsTable(_Table):
     """Limits on every setpoint, and what the vehicles are assumed to measure."""
 
     speed_max_m_s: Annotated[float, Field(ge=0.2, le=12, allow_inf_nan=False)] = 4.0
-    climb_max_m_s: Annotated[float, Field(gt=0, le=3, allow_inf_nan=False)] = 1.5
-    descent_max_m_s: Annotated[float, Field(gt=0, le=1.5, allow_inf_nan=False)] = 1.0
-    jerk_max_m_s3: Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)] = 100.0
-    avoidance_acceleration_m_s2: Annotated[float, Field(gt=0, le=8, allow_inf_nan=False)] = 8.0
+    climb_max_m_s: Annotated[float, Field(ge=0.1, le=3, allow_inf_nan=False)] = 1.5
+    """slower, an estimator's vertical noise moves a vehicle faster than its plan"""
+    descent_max_m_s: Annotated[float, Field(ge=0.1, le=1.5, allow_inf_nan=False)] = 1.0
+    jerk_max_m_s3: Annotated[float, Field(ge=5, le=1000, allow_inf_nan=False)] = 100.0
+    """at least: what plans ask for (1 m/s^2) within 0.2 s, the lag of a good velocity loop"""
+    avoidance_acceleration_m_s2: Annotated[float, Field(ge=2, le=8, allow_inf_nan=False)] = 8.0
+    """what every command is held to: at least what the law needs, or it could neither follow a plan nor brake"""
     barrier: bool = True
     control_rate_hz: Annotated[float, Field(ge=20, le=50, allow_inf_nan=False)] = 50.0
-    position_noise_m: NotNegative = 0.05
-    velocity_noise_m_s: NotNegative = 0.05
-    gust_m_s2: NotNegative = 0.3
+    position_noise_m: Noise = 0.05
+    velocity_noise_m_s: Noise = 0.05
+    gust_m_s2: Noise = 0.3
 
 
 class FenceTable(_Table):
@@ -234,15 +247,19 @@ class PeersTable(_Table):
     range_m: Positive = 100.0
     digest: Annotated[int, Field(ge=0, le=30)] = 3
     """how many peers' latest samples a message carries"""
-    wait_s: Positive = 60.0
+    wait_s: Wait = 60.0
     """how long a vehicle in the air waits for the others"""
     missing: Literal["land", "continue"] = "land"
     """what it does then: land, or form with those that are up"""
-    isolated_flight_s: Positive = 5.0
+    isolated_flight_s: Wait = 5.0
     """how long a vehicle that hears nobody flies on before it holds"""
     network: Literal["laptop", "field"] = "laptop"
     scouting_port: Annotated[int, Field(ge=1024, le=65535)] | None = None
     """multicast port by which a laptop's vehicles find each other; None: from the fleet's name"""
+
+
+PadLimit = Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)]
+"""how far from its place a vehicle may be found: beyond a hundred metres it is another field"""
 
 
 class PreflightTable(_Table):
@@ -250,23 +267,24 @@ class PreflightTable(_Table):
 
     battery_min_percent: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)] = 30.0
     """0: not looked at"""
-    position_rate_min_hz: Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)] = 10.0
-    round_trip_limit_s: Annotated[float, Field(gt=0, le=10, allow_inf_nan=False)] = 0.25
-    """companion to autopilot and back"""
-    clock_limit_s: Annotated[float, Field(gt=0, le=10, allow_inf_nan=False)] = 0.1
-    """between any two companions"""
+    position_rate_min_hz: Annotated[float, Field(ge=5, le=1000, allow_inf_nan=False)] = 10.0
+    """slower, a vehicle at the speed limit flies a metre between two positions"""
+    round_trip_limit_s: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = 0.25
+    """companion to autopilot and back; beyond 0.3 s vehicles swing (`docs/limits.md`)"""
+    clock_limit_s: Annotated[float, Field(gt=0, le=0.5, allow_inf_nan=False)] = 0.1
+    """between any two companions; samples from a second ahead are refused, and plans are flown by the clock"""
     autopilot_clock_limit_s: Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)] = 6.0
     """between a companion and its autopilot; PX4 sets its clock by GPS only when it is off by 5 s"""
     origin_limit_m: Positive = 1000.0
     """estimators' origins from the fleet origin, and from each other"""
-    altitude_limit_m: Positive = 5.0
+    altitude_limit_m: PadLimit = 5.0
     """a vehicle on its pad, and its home, from the fleet origin's altitude"""
-    altitude_spread_m: Positive = 3.0
+    altitude_spread_m: PadLimit = 3.0
     """vehicles on their pads, and their homes, from each other"""
-    pad_limit_m: Positive = 10.0
+    pad_limit_m: PadLimit = 10.0
     """a vehicle from its own pad"""
-    offboard_loss_limit_s: Annotated[float, Field(gt=0, le=60, allow_inf_nan=False)] = 1.0
-    """the autopilot's COM_OF_LOSS_T"""
+    offboard_loss_limit_s: Annotated[float, Field(gt=0, le=5, allow_inf_nan=False)] = 1.0
+    """the autopilot's COM_OF_LOSS_T: for so long a vehicle flies on with its last setpoint"""
     require_rc: bool = False
     """whether every vehicle has a pilot with a transmitter"""
 
@@ -279,7 +297,7 @@ class FailsafeTable(_Table):
     """return: the whole fleet flies back over its pads and lands there"""
     battery_critical_percent: Percent = 12.0
     """land at once; 0 never"""
-    isolated_hold_s: Positive = 10.0
+    isolated_hold_s: Wait = 10.0
     """how long a vehicle that hears nobody stands before it lands"""
 
 
@@ -442,6 +460,15 @@ class FleetConfig(_Table):
         """Smallest distance of two slots that leaves separation and barrier alone (m)."""
         barrier = self.safety_radius_m if self.limits.barrier else 0.0
         return max(self.r0_m, barrier) + SPACING_MARGIN_M
+
+    @property
+    def range_min_m(self) -> float:
+        """Smallest range at which peers are looked at (m): a neighbour's distance, and what two at the speed limit that
+        fly at each other need to stop, after what the exchange takes."""
+        x = self.limits
+        late_s = EXCHANGE_LATENCY_S + 1.0 / x.control_rate_hz
+        braking_m = x.speed_max_m_s * late_s + x.speed_max_m_s**2 / (2.0 * x.avoidance_acceleration_m_s2)
+        return self.formation.spacing_m + 2.0 * braking_m
 
     @property
     def return_speed_m_s(self) -> float:
@@ -733,6 +760,11 @@ def _faults(config: FleetConfig) -> Iterator[str]:
         yield (
             f"$.trigger.t_min_s must be below $.trigger.t_max_s = {config.trigger.t_max_s:g} s, "
             f"got {config.trigger.t_min_s:g}"
+        )
+    if config.peers.range_m < config.range_min_m:
+        yield (
+            f"$.peers.range_m must be at least {config.range_min_m:.2f} m ($.formation.spacing_m, and twice the way of "
+            f"braking from $.limits.speed_max_m_s), got {config.peers.range_m:g}"
         )
     yield from _plan_faults(config)
     if config.fence is not None:

@@ -292,6 +292,9 @@ def examined(motion: Motion, fence: Fence) -> tuple[Breach | None, float]:
     if march.allowed_m < -2.0 * TOLERANCE_M:
         end = spans[-1]
         room, vehicle = march.least_room(end.end_ns)
+        if isfinite(motion.leg_starts[-1][0]):
+            # A velocity that is kept must lead back too.
+            room, vehicle = min((room, vehicle), march.least_room(end.end_ns + 1_000_000_000))
         if room >= march.allowed_m:
             return None, march.looks
         return Breach(end.leg, vehicle, -room, (end.end_ns - motion.start_ns) * 1e-9), march.looks
