@@ -451,7 +451,7 @@ def test_a_sender_that_rages_does_not_silence_the_others() -> None:
 
 
 def test_a_flood_of_the_hardest_plans_costs_looks_that_do_not_grow_with_it() -> None:
-    """100 a second for ten seconds, each different, as nine peers: most are not even read. Later a good one passes."""
+    """100 a second for ten seconds, each different, as nine peers: most are not even read. A good one passes then."""
     agent, random_ = Agent(CONFIG, 1, boot_id=1), random.Random(5)
     payloads = [encode_motion(replace(hard(random_, 40), issuer=k)) for k in range(20)]
     for k in range(1000):
