@@ -23,6 +23,9 @@ NOTCHED = Fence(
     2.0, 50.0,
     corners_m=((-60.0, -60.0), (60.0, -60.0), (60.0, -6.0), (0.0, 0.0), (60.0, 6.0), (60.0, 60.0), (-60.0, 60.0)),
 )  # fmt: skip
+OCTAGON = Fence(
+    2.0, 50.0, corners_m=tuple((52.0 * math.cos(k * pi / 4), 52.0 * math.sin(k * pi / 4)) for k in range(8))
+)
 
 
 def motion(*legs: Leg, count: int = 5, shape: str = "v", velocity: Ned = ZERO, follow: bool = False) -> Motion:
@@ -187,7 +190,7 @@ legs = st.one_of(
 @settings(deadline=None, max_examples=60)
 @given(
     st.lists(legs, min_size=1, max_size=3),
-    st.sampled_from([FENCE, NOTCHED]),
+    st.sampled_from([FENCE, NOTCHED, OCTAGON]),
     st.booleans(),
     st.sampled_from(["v", "line"]),
 )
@@ -202,3 +205,27 @@ def test_the_march_finds_what_dense_sampling_finds(plan: list[Leg], fence: Fence
     if breach is not None:
         assert math.isclose(breach.outside_m, -fence.room_m(m.reference(breach.vehicle_id, round(breach.time_s * 1e9)).position_ned_m), abs_tol=1e-5)  # fmt: skip  # noqa: E501
         assert breach.outside_m <= -worst + NEAR_M
+
+
+within = st.tuples(st.floats(-70.0, 70.0), st.floats(-70.0, 70.0))
+
+
+@given(within, within, st.sampled_from([FENCE, NOTCHED, OCTAGON, Fence(2.0, 50.0)]))
+def test_the_least_room_along_a_straight_way_is_what_dense_sampling_finds(
+    a: tuple[float, float], b: tuple[float, float], fence: Fence
+) -> None:
+    sampled = min(fence.edge_room_m(*(p + (q - p) * k / 400 for p, q in zip(a, b, strict=True))) for k in range(401))
+    least = fence.edge_room_along_m(*a, *b)
+    if sampled < 0.0:
+        assert least < 0.5
+    if least < -fence.margin_m:
+        assert sampled < 0.0
+    if min(sampled, least) >= 0.0:
+        assert least == pytest.approx(sampled, abs=0.5)
+        assert least <= sampled + 1e-9
+
+
+def test_only_a_notch_makes_a_fence_that_is_not_convex() -> None:
+    assert [f.convex for f in (FENCE, OCTAGON, NOTCHED, replace(OCTAGON, corners_m=OCTAGON.corners_m[::-1]))] == [
+        True, True, False, True,
+    ]  # fmt: skip
