@@ -89,7 +89,17 @@ def flood(fleet: Fleet, operator: Operator) -> int:
 def flown(folder: Path, flooded: bool) -> Seen:
     fleet = make_fleet(folder, 5, fence=FENCE, plan={"then": "stay"})
     out = fleet.folder / "flights"
-    arguments = ("sim", "up", "--json", "--fleet", str(fleet.file), "--out", str(out), "--plan", "velocity:0.3:0:3600")
+    arguments = (
+        "sim",
+        "up",
+        "--json",
+        "--fleet",
+        str(fleet.file),
+        "--out",
+        str(out),
+        "--plan",
+        "velocity:0.5:0:10,turn:3",
+    )
     with started(*arguments, folder=folder, name="up") as up, operator_of(fleet) as operator:
         wait_for(operator, all_in(fleet.ids, *SETTLED, revision=2))
         begin_ns = time.time_ns()
