@@ -108,8 +108,10 @@ def _form_fault(motion: Motion) -> Fault | None:
             return Fault("a leg after an endless turn", f"its leg {k} turns for ever, but legs follow", k)
     if not motion.slots:
         return Fault("no slots", "it has no slots")
-    if motion.legs_start_ns > motion.start_ns or motion.blend_start_ns > motion.start_ns:
-        return Fault("times", "its legs or its change of formation start after it does")
+    if motion.legs_start_ns > motion.start_ns:
+        return Fault("times", "its legs start after it does")
+    if not (motion.blend_start_ns - motion.start_ns) * 1e-9 <= DURATION_MAX_S:
+        return Fault("times", "its change of formation starts more than a day after it does")
     since_s = (motion.start_ns - motion.legs_start_ns) * 1e-9
     if motion.legs and not since_s <= DURATION_MAX_S:
         return Fault("too long", f"its legs began {since_s:.0f} s before it, may begin {DURATION_MAX_S:.0f} s before")
@@ -170,8 +172,9 @@ def _times_of_slots(motion: Motion) -> Iterator[int]:
     """Times at which slots move against each other fastest, or may (fleet ns)."""
     start_ns, zero_ns = motion.start_ns, motion.legs_start_ns
     if motion.blend_end_ns > start_ns and motion.blend_s > 0.0:
-        span_ns = motion.blend_end_ns - start_ns
-        yield from (start_ns + span_ns * k // BLEND_LOOKS for k in range(BLEND_LOOKS + 1))
+        from_ns = max(motion.blend_start_ns, start_ns)
+        span_ns = motion.blend_end_ns - from_ns
+        yield from (from_ns + span_ns * k // BLEND_LOOKS for k in range(BLEND_LOOKS + 1))
     if motion.heading_rate_rad_s != 0.0:
         yield from (zero_ns + round(TURN_RAMP_S * k / 8 * 1e9) for k in range(9))
     if motion.heading_follows_turns:
