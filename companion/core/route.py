@@ -35,8 +35,10 @@ RESOLUTION_M = 0.01
 """a breach between two looks that is no deeper than this may be missed"""
 LOOKS_MAX = 1400
 """most looks at a motion of up to ten vehicles; of more vehicles more, up to three times as many"""
-SLOT_LOOKS, EDGE_LOOKS = 0.25, 0.4
-"""cost of one slot's place over that of a look at the centre, and of one edge of a polygon over that of the place"""
+SLOT_LOOKS = 0.25
+"""cost of one slot's place over that of a look at the centre"""
+EDGE_LOOKS, NOTCHED_EDGE_LOOKS = 0.1, 0.25
+"""cost of one edge of a polygon over that of the place"""
 DEPTH_PARTS = 24
 """a leg that leads outside is looked at in so many parts, and its worst part again, to tell how far it leads"""
 TOLERANCE_M = 1e-6
@@ -163,10 +165,11 @@ class _March:
         self._level_m = max(hypot(s.north, s.east) for s in ends)
         self._least_down_m, self._most_down_m = min(s.down for s in ends), max(s.down for s in ends)
         self._way_m = max(dist(*change) for change in self.motion.slots.values())
-        edges, count = len(self.fence.corners_m), len(self.motion.slots)
+        count = len(self.motion.slots)
+        edges = len(self.fence.corners_m) * (EDGE_LOOKS if self.fence.convex else NOTCHED_EDGE_LOOKS)
         self._looks_max = LOOKS_MAX * min(max(count / 10.0, 1.0), 3.0)
-        self._centre_cost = 1.0 + SLOT_LOOKS * EDGE_LOOKS * edges
-        self._slots_cost = SLOT_LOOKS * count * (1.0 + EDGE_LOOKS * edges)
+        self._centre_cost = 1.0 + SLOT_LOOKS * edges
+        self._slots_cost = SLOT_LOOKS * count * (1.0 + edges)
 
     @property
     def exhausted(self) -> bool:
