@@ -33,7 +33,7 @@ def run(
     """Fly one vehicle: read its autopilot, hear and tell its peers, send setpoints. Ctrl-C lands it and ends.
 
     Exit status: 0 ended with the vehicle landed or landing, 2 wrong usage or configuration, 3 ended while the autopilot
-    had not confirmed landing.
+    had not confirmed landing, 4 could do nothing any more (a fault of ours; the autopilot's failsafe has the vehicle).
     """
     from companion.io.loop import Companion, RunSettings
 

@@ -14,12 +14,14 @@ from typing import Any
 
 from companion.autopilot import AutopilotClient
 from companion.config import FleetConfig
+from companion.core.budget import Bucket, ExaminationBudget
 from companion.core.counts import Counts, Refusal, RefusalKind
 from companion.core.estimate import BiasObserver, SendFilter
 from companion.core.events import Event, MotionAdopted
 from companion.core.failsafe import LATE_S, Failsafe
 from companion.core.frames import Ned, geodetic_to_ned
 from companion.core.law import Law, StarlingLaw
+from companion.core.motion_check import Fault, examine
 from companion.core.near import PUSH_M_S2, NearMode, near_push_m_s2
 from companion.core.neighbours import PeerTable, held
 from companion.core.plan import (
@@ -30,12 +32,8 @@ from companion.core.plan import (
     assignment_matches,
     motion_order,
     over_the_pads,
-    top_speed_m_s,
-    with_formation,
     with_legs,
-    with_return,
 )
-from companion.core.route import first_breach, only_stops
 from companion.core.safety import SafetyFilter, push_m_s2
 from companion.core.trigger import Situation
 from companion.core.values import (
@@ -70,13 +68,17 @@ RESEND_NS = (250_000_000, 1_000_000_000)
 """a change of phase or motion is repeated after these delays, since one message may be lost"""
 OUT_OF_FORMATION = frozenset({Phase.IDLE, Phase.APART, Phase.LANDING, Phase.LANDED, Phase.RELEASED})
 """phases of peers for which nobody waits any more once the formation has been taken"""
-LEVEL_M_S = 1e-6
 FAILSAFES_TOLD_MOST = 20
 """the last ones stand in a status: one that comes again and again must not make it too large to be sent"""
 RESENDS_MAX = 8
 CATCH_UP_NS = 1_000_000_000
 SPREAD_NS = 50_000_000
 """times the vehicles, up to CATCH_UP_NS: over this time they spread what all have reason to say at once"""
+COMMAND_LOOKS_PER_S, COMMAND_LOOKS_MOST = 400.0, 2000.0
+"""what examining commanded motions may cost (`core.budget`)"""
+DECODING_LOOKS_PER_BYTE = 0.002
+REFUSED_KEPT = 8
+"""so many plans that were refused for what they are, not for when they came, are not examined again"""
 PLAN_COPIES = 2
 """a plan that this many others have just told need not be told again"""
 REJECTED = (
@@ -84,7 +86,10 @@ REJECTED = (
     "state: id is not the key's",
     *(f"{topic}: {kind}" for topic in ("state", "plan") for kind in WIRE_FAULTS),
     *(f"plan: {kind}" for kind in RefusalKind),
-    *(f"command: {kind}" for kind in (*ORDER_FAULTS, "motion")),
+    "plan: foreign id",
+    "plan: refused before",
+    "plan: more than can be examined",
+    *(f"command: {kind}" for kind in (*ORDER_FAULTS, "motion", "more than can be examined")),
     *(failsafe.value for failsafe in Failsafe),
 )
 """what an agent counts"""
@@ -182,6 +187,9 @@ class Agent:
         self._resend_ns: list[int] = []
         self._plan_due_ns: int | None = None
         self._plan_payload = encode_motion(self.programme.newest)
+        self._refused_plans: list[bytes] = []
+        self._plans_budget = ExaminationBudget(others)
+        self._commands_budget = Bucket(COMMAND_LOOKS_PER_S, COMMAND_LOOKS_MOST)
         self._plan_told = 0
         """how often others told it since our telling became due"""
         self._spread_ns = min(SPREAD_NS * len(config.vehicles), CATCH_UP_NS)
@@ -229,12 +237,7 @@ class Agent:
             return
         try:
             if topic == "plan":
-                if payload == self._plan_payload:
-                    self._plan_told += 1
-                    if self._plan_told >= PLAN_COPIES:
-                        self._plan_due_ns = None
-                else:
-                    self._consider(decode_motion(payload), now)
+                self._receive_plan(key, payload, now)
                 return
             message = decode_state(payload)
         except WireError as error:
@@ -262,6 +265,26 @@ class Agent:
         """Whether somebody else spoke under this vehicle's id lately."""
         stale_ns = self.peers.limits.stale_after_s * 1e9
         return self._own_id_ns is not None and now.monotonic_ns - self._own_id_ns < stale_ns
+
+    def _receive_plan(self, key: str, payload: bytes, now: Instant) -> None:
+        if payload == self._plan_payload:
+            self._plan_told += 1
+            if self._plan_told >= PLAN_COPIES:
+                self._plan_due_ns = None
+            return
+        sender = next((i for i in self.peers.ids if key.endswith(f"/{i}/plan")), None)
+        if sender is None:
+            self.rejected["plan: foreign id"] += 1
+        elif payload in self._refused_plans:
+            self.rejected["plan: refused before"] += 1
+        elif not self._plans_budget.open(sender, now.monotonic_ns):
+            self.rejected["plan: more than can be examined"] += 1
+        else:
+            self._plans_budget.spend(sender, 1.0 + DECODING_LOOKS_PER_BYTE * len(payload))
+            fault, looks = self._consider(decode_motion(payload), now)
+            self._plans_budget.spend(sender, looks)
+            if fault is not None and fault.lasting:
+                self._refused_plans = [*self._refused_plans[1 - REFUSED_KEPT :], payload]
 
     def receive_presence(self, vehicle_id: int, alive: bool, now: Instant) -> None:
         """A peer's process appeared or ended."""
@@ -306,12 +329,17 @@ class Agent:
             case "kill":
                 confirmed = order.fields.get("confirm") is True
                 return self.flight.kill(now) if confirmed else "kill needs its confirmation"
+        if not self._commands_budget.open(now.monotonic_ns):
+            self.rejected["command: more than can be examined"] += 1
+            return "too many motions at once: command it again"
         try:
             motion = decode_motion(json.dumps(order.fields.get("motion")).encode())
         except WireError as error:
             self.rejected["command: motion"] += 1
             return str(error)
-        return self._consider(motion, now)
+        fault, looks = self._consider(motion, now)
+        self._commands_budget.spend(1.0 + looks)
+        return None if fault is None else fault.sentence
 
     def _refuse(self, refusal: Refusal, in_order: bool = True) -> bytes:
         self.rejected[f"command: {refusal.kind}"] += 1
@@ -407,54 +435,51 @@ class Agent:
 
     # -- motions -----------------------------------------------------------------------------------------------------
 
-    def _consider(self, motion: Motion, now: Instant) -> str | None:
-        """Adopt a motion of somebody else's if it is newer and sound; returns why it was refused."""
-        if motion.order <= self.programme.newest.order:
-            known = self.programme.newest.order == motion.order
-            return None if known else f"revision {motion.revision} is not newer than {self.programme.newest.revision}"
-        refusal = self._unsound(motion, now)
-        if refusal is not None:
-            self.rejected[f"plan: {refusal.kind}"] += 1
-            return refusal.sentence
-        self._adopt(motion, now)
-        return None
-
-    def _unsound(self, motion: Motion, now: Instant) -> Refusal | None:
-        told = [s.revision for i in self.peers.ids if (s := self.peers.sample(i)) is not None]
-        fault = revision_fault(motion.revision, self.programme.newest.revision, told)
+    def _consider(self, motion: Motion, now: Instant) -> tuple[Fault | None, float]:
+        """Adopt a motion of somebody else's if it is newer and sound; why it was refused, and the looks it took."""
+        newest = self.programme.newest
+        if motion.order <= newest.order:
+            sentence = f"revision {motion.revision} is not newer than {newest.revision}"
+            return None if newest.order == motion.order else Fault(RefusalKind.NOT_NEWER, sentence), 0.0
+        fault, looks = self._unsound(motion, now)
         if fault is not None:
-            return Refusal(RefusalKind.REVISION, fault)
-        if set(motion.slots) != set(self.programme.newest.slots):
-            return Refusal(RefusalKind.VEHICLES, "its vehicles are not this fleet's")
+            self.rejected[f"plan: {fault.kind}"] += 1
+        else:
+            self._adopt(motion, now)
+        return fault, looks
+
+    def _unsound(self, motion: Motion, now: Instant) -> tuple[Fault | None, float]:
+        """Why a motion cannot follow the newest, and the looks that it took; what is cheap to see comes first."""
+        newest = self.programme.newest
+        told = [s.revision for i in self.peers.ids if (s := self.peers.sample(i)) is not None]
+        ahead = revision_fault(motion.revision, newest.revision, told)
+        if ahead is not None:
+            return Fault(RefusalKind.REVISION, ahead), 0.0
+        if motion.slots.keys() != newest.slots.keys():
+            return Fault(RefusalKind.VEHICLES, "its vehicles are not this fleet's"), 0.0
         if abs(motion.start_ns - now.fleet_ns) > 3_600_000_000_000:
-            return Refusal(RefusalKind.START, "it starts more than an hour from now; are the clocks set?")
-        fastest = top_speed_m_s(motion)
-        if not fastest <= self.config.limits.speed_max_m_s:
-            most = self.config.limits.speed_max_m_s
-            return Refusal(RefusalKind.SPEED, f"its centre flies at more than {most:g} m/s, at {fastest:.1f} m/s")
-        breach = first_breach(motion, self.config.geofence)
-        if breach is not None and not only_stops(motion, self.programme.newest):
-            return Refusal(RefusalKind.FENCE, f"it leads outside the fence, {breach.sentence()}")
-        if motion.then == "stay" and abs(motion.climb_at_end_m_s) > LEVEL_M_S:
-            return Refusal(RefusalKind.CLIMB, "it climbs or sinks for ever; give an altitude to go to")
+            sentence = "it starts more than an hour from now; are the clocks set?"
+            return Fault(RefusalKind.START, sentence), 0.0
         away_m = self._away_m(motion, now)
         if not away_m <= self.config.peers.range_m:
-            return Refusal(
-                RefusalKind.RANGE, f"it begins out of range, {away_m:.0f} m from where this vehicle is to be"
-            )
+            sentence = f"it begins out of range, {away_m:.0f} m from where this vehicle is to be"
+            return Fault(RefusalKind.RANGE, sentence), 1.0
+        fault, looks = examine(motion, self.config.motion_limits, newest)
+        return fault or self._foreign_slots(motion), looks
+
+    def _foreign_slots(self, motion: Motion) -> Fault | None:
+        """Slots that this vehicle would not assign from its own configuration."""
         if motion.shape == PADS:
-            if over_the_pads(motion, self.config.first_motion):
-                return None
-            return Refusal(RefusalKind.SLOTS, "its pads are not this vehicle's; do the configurations differ?")
-        try:
-            slots = self.config.slots(motion.shape)
-        except ConfigError as error:
-            return Refusal(RefusalKind.SHAPE, str(error))
-        if not assignment_matches(motion, slots, self.config.pinned):
-            return Refusal(
-                RefusalKind.SLOTS, "its slots are not what this vehicle assigns; do the configurations differ?"
-            )
-        return None
+            kind = RefusalKind.PADS
+            same = over_the_pads(motion, self.config.first_motion)
+        else:
+            kind = RefusalKind.SLOTS
+            try:
+                slots = self.config.slots(motion.shape)
+            except ConfigError as error:
+                return Fault(RefusalKind.SHAPE, str(error))
+            same = assignment_matches(motion, slots, self.config.pinned)
+        return None if same else Fault(kind, f"{kind}; do the configurations differ?")
 
     def _away_m(self, motion: Motion, now: Instant) -> float:
         """How far the own slot jumps when a motion begins (m); a vehicle that does not fly jumps nowhere."""
@@ -521,8 +546,9 @@ class Agent:
             self._return(self._return_motion(max(start_ns, newest.start_ns + 1)), now)
         elif forms:
             self._adopt(self._formation_motion(self.config.formation.shape, start_ns), now)
-        elif legs := self.config.plan_legs(newest.moment(start_ns).centre.position):
-            then = self.config.plan.then
+        elif self.config.plan.legs:
+            centre = newest.moment(start_ns).centre
+            legs, then = self.config.plan_legs(centre.position, centre.velocity), self.config.plan.then
             self._adopt(with_legs(newest, at_ns=start_ns, issuer=self.id, legs=legs, then=then), now)
 
     def _all_up(self) -> bool:
@@ -531,17 +557,14 @@ class Agent:
 
     def _return(self, motion: Motion, now: Instant) -> None:
         """Propose the way back, or land here where it would lead outside the fence: the others would refuse it."""
-        refusal = self._unsound(motion, now)
-        if refusal is None:
+        fault, _ = self._unsound(motion, now)
+        if fault is None:
             self._adopt(motion, now)
         else:
-            self.flight.no_way_back(refusal.sentence, now)
+            self.flight.no_way_back(fault.sentence, now)
 
     def _return_motion(self, start_ns: int) -> Motion:
-        return with_return(
-            self.programme.newest, self.config.first_motion, at_ns=start_ns, issuer=self.id,
-            speed_m_s=self.config.return_speed_m_s,
-        )  # fmt: skip
+        return self.config.motion_home(self.programme.newest, start_ns, self.id)
 
     def _all_formed(self, now: Instant) -> bool:
         """This vehicle has formed, and every peer that flies with it, under the newest motion; or all waited long.
@@ -562,10 +585,7 @@ class Agent:
         return True
 
     def _formation_motion(self, shape: str, start_ns: int) -> Motion:
-        return with_formation(
-            self.programme.newest, at_ns=start_ns, issuer=self.id, shape=shape, slots=self.config.slots(shape),
-            pinned=self.config.pinned, speed_m_s=self.config.limits.speed_max_m_s / 2,
-        )  # fmt: skip
+        return self.config.motion_into(shape, self.programme.newest, start_ns, self.id)
 
     # -- time --------------------------------------------------------------------------------------------------------
 

@@ -26,22 +26,37 @@ from companion.core.frames import Geodetic, Ned
 from companion.core.hold import HoldKind
 from companion.core.law import Gains, paper_gains
 from companion.core.monitor import PeerMotion
+from companion.core.motion_check import (
+    ALTITUDE_MIN_M,
+    DURATION_MAX_S,
+    LEGS_MAX,
+    PLACE_MAX_M,
+    PLAN_SPEED_SHARE,
+    TURN_ANGLE_MAX_DEG,
+    TURN_ANGLE_MIN_DEG,
+    TURN_RATE_MAX_DEG_S,
+    TURN_RATE_MIN_DEG_S,
+    VELOCITY_MAX_M_S,
+    Fault,
+    MotionLimits,
+    examine,
+)
 from companion.core.neighbours import PeerLimits
 from companion.core.plan import (
     PADS,
-    GotoLeg,
     Leg,
     Motion,
     SlotChange,
     Then,
     TurnLeg,
     VelocityLeg,
-    goto_duration_s,
+    goto_leg,
+    leg_end,
+    top_speed_m_s,
     with_formation,
     with_legs,
     with_return,
 )
-from companion.core.route import first_breach
 from companion.core.safety import DOWNWASH_RATIO, SafetyLimits, safety_radius_m
 from companion.core.trigger import (
     ErrorTrigger,
@@ -58,17 +73,15 @@ Real = Annotated[float, Field(ge=-1e5, le=1e5, allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, le=1e5, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, le=1e5, allow_inf_nan=False)]
 Gain = Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)]
+Noise = Annotated[float, Field(ge=0, le=5, allow_inf_nan=False)]
+"""standard deviation that an estimator, or the air, is assumed to have; with more nobody flies in formation"""
+Wait = Annotated[float, Field(ge=1, le=3600, allow_inf_nan=False)]
+"""a time for which a vehicle waits: a second at least, since the exchange takes some; no longer than batteries last"""
 Percent = Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)]
 VehicleId = Annotated[int, Field(ge=1, le=250)]
 
-PLAN_SPEED_SHARE = 0.75
-"""part of the speed limits that the plan may ask for; the rest is left to keep up with it"""
-TURN_RATE_MIN_DEG_S = 0.01
-"""slower turns are refused: their arcs are straight lines to a double's precision"""
 LANDED_APART_M = 1.0
 """vehicles that land where they are come down so far apart: a collision's distance, and the wander of both"""
-ALTITUDE_MIN_M = 1.0
-"""no slot lower than this above the fleet origin"""
 SPACING_MARGIN_M = 0.2
 """slots stay this much farther apart than separation and barrier begin to act"""
 STALE_AFTER = 2.1
@@ -110,33 +123,38 @@ class FormationTable(_Table):
     """slots of shape "custom": forward, right, down"""
 
 
+LegDuration = Annotated[float, Field(ge=0, le=DURATION_MAX_S, allow_inf_nan=False)]
+LegVelocity = Annotated[float, Field(ge=-VELOCITY_MAX_M_S, le=VELOCITY_MAX_M_S, allow_inf_nan=False)]
+
+
 class HoldLegTable(_Table):
     kind: Literal["hold"]
-    duration_s: NotNegative
+    duration_s: LegDuration
 
 
 class VelocityLegTable(_Table):
     kind: Literal["velocity"]
-    north_m_s: Real = 0.0
-    east_m_s: Real = 0.0
-    up_m_s: Real = 0.0
-    duration_s: Positive
+    north_m_s: LegVelocity = 0.0
+    east_m_s: LegVelocity = 0.0
+    up_m_s: LegVelocity = 0.0
+    duration_s: Annotated[float, Field(gt=0, le=DURATION_MAX_S, allow_inf_nan=False)]
 
 
 class TurnLegTable(_Table):
     kind: Literal["turn"]
-    rate_deg_s: Annotated[float, Field(ge=-60, le=60, allow_inf_nan=False)]
+    rate_deg_s: Annotated[float, Field(ge=-TURN_RATE_MAX_DEG_S, le=TURN_RATE_MAX_DEG_S, allow_inf_nan=False)]
     """positive turns right"""
-    angle_deg: Annotated[float, Field(gt=0, le=36000, allow_inf_nan=False)] | None = None
+    angle_deg: Annotated[float, Field(ge=TURN_ANGLE_MIN_DEG, le=TURN_ANGLE_MAX_DEG, allow_inf_nan=False)] | None = None
     """None circles for ever"""
 
 
 class GotoLegTable(_Table):
     kind: Literal["goto"]
-    north_m: Real
-    east_m: Real
+    north_m: Annotated[float, Field(ge=-PLACE_MAX_M, le=PLACE_MAX_M, allow_inf_nan=False)]
+    east_m: Annotated[float, Field(ge=-PLACE_MAX_M, le=PLACE_MAX_M, allow_inf_nan=False)]
     altitude_m: Annotated[float, Field(ge=1, le=500, allow_inf_nan=False)] | None = None
-    speed_m_s: Annotated[float, Field(ge=0.1, le=12, allow_inf_nan=False)] = 1.0
+    speed_m_s: Annotated[float, Field(ge=0.1, le=VELOCITY_MAX_M_S, allow_inf_nan=False)] = 1.0
+    """greatest speed of the centre; less where the vertical limits or a short way ask for it"""
 
 
 LegTable = Annotated[HoldLegTable | VelocityLegTable | TurnLegTable | GotoLegTable, Field(discriminator="kind")]
@@ -145,7 +163,7 @@ LegTable = Annotated[HoldLegTable | VelocityLegTable | TurnLegTable | GotoLegTab
 class PlanTable(_Table):
     """How the formation moves once all have formed."""
 
-    legs: tuple[LegTable, ...] = ()
+    legs: Annotated[tuple[LegTable, ...], Field(max_length=LEGS_MAX)] = ()
     heading: Literal["fixed", "track"] = "fixed"
     """track: the formation's heading follows turns"""
     then: Then = "stay"
@@ -159,13 +177,15 @@ class LawTable(_Table):
 
     kind: Literal["starling", "paper"] = "starling"
     hold: HoldKind = "damped"
-    hold_damping_s: Positive = 0.7
+    hold_damping_s: Annotated[float, Field(ge=0.05, le=10, allow_inf_nan=False)] = 0.7
+    """shorter, a prediction forgets velocity within a tick or two; longer, it runs away with it"""
     k_s: Gain = 3.0
     k_a: Gain = 3.0
     k_c: Gain = 4.0
     k_v: Gain = 1.0
     k_p: Gain = 0.3
-    a_max_m_s2: Annotated[float, Field(gt=0, le=20, allow_inf_nan=False)] = 5.0
+    a_max_m_s2: Annotated[float, Field(ge=2, le=20, allow_inf_nan=False)] = 5.0
+    """at least twice what plans ask for (1 m/s^2): the rest keeps the formation against gusts"""
     r0_m: Annotated[float, Field(ge=0.1, le=1000, allow_inf_nan=False)] | None = None
     """range of separation; None: half the spacing"""
 
@@ -174,11 +194,15 @@ class TriggerTable(_Table):
     """When to tell the peers."""
 
     kind: TriggerKind = "error"
-    epsilon_m: Positive = 0.3
-    gamma_s2: Positive = 0.1
-    kappa: NotNegative = 0.3
-    t_min_s: NotNegative = 0.05
-    t_max_s: Annotated[float, Field(gt=0, le=60, allow_inf_nan=False)] = 10.0
+    epsilon_m: Annotated[float, Field(ge=0.01, le=5, allow_inf_nan=False)] = 0.3
+    """below a centimetre every tick is an event; the safety radius grows with it"""
+    gamma_s2: Annotated[float, Field(ge=1e-4, le=100, allow_inf_nan=False)] = 0.1
+    """an error of velocity counts as an error of place sqrt(gamma) seconds later"""
+    kappa: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)] = 0.3
+    t_min_s: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)] = 0.05
+    """longer, an event would wait for longer than the safety radius allows for"""
+    t_max_s: Annotated[float, Field(ge=0.5, le=60, allow_inf_nan=False)] = 10.0
+    """shorter, a peer would be stale between two of its ticks"""
     period_s: Positive = 0.05
     """of kind "periodic" """
     near_period_s: Annotated[float, Field(ge=0.05, le=0.2, allow_inf_nan=False)] = 0.1
@@ -195,15 +219,18 @@ class LimitsTable(_Table):
     """Limits on every setpoint, and what the vehicles are assumed to measure."""
 
     speed_max_m_s: Annotated[float, Field(ge=0.2, le=12, allow_inf_nan=False)] = 4.0
-    climb_max_m_s: Annotated[float, Field(gt=0, le=3, allow_inf_nan=False)] = 1.5
-    descent_max_m_s: Annotated[float, Field(gt=0, le=1.5, allow_inf_nan=False)] = 1.0
-    jerk_max_m_s3: Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)] = 100.0
-    avoidance_acceleration_m_s2: Annotated[float, Field(gt=0, le=8, allow_inf_nan=False)] = 8.0
+    climb_max_m_s: Annotated[float, Field(ge=0.1, le=3, allow_inf_nan=False)] = 1.5
+    """slower, an estimator's vertical noise moves a vehicle faster than its plan"""
+    descent_max_m_s: Annotated[float, Field(ge=0.1, le=1.5, allow_inf_nan=False)] = 1.0
+    jerk_max_m_s3: Annotated[float, Field(ge=5, le=1000, allow_inf_nan=False)] = 100.0
+    """at least: what plans ask for (1 m/s^2) within 0.2 s, the lag of a good velocity loop"""
+    avoidance_acceleration_m_s2: Annotated[float, Field(ge=2, le=8, allow_inf_nan=False)] = 8.0
+    """what every command is held to: at least what the law needs, or it could neither follow a plan nor brake"""
     barrier: bool = True
     control_rate_hz: Annotated[float, Field(ge=20, le=50, allow_inf_nan=False)] = 50.0
-    position_noise_m: NotNegative = 0.05
-    velocity_noise_m_s: NotNegative = 0.05
-    gust_m_s2: NotNegative = 0.3
+    position_noise_m: Noise = 0.05
+    velocity_noise_m_s: Noise = 0.05
+    gust_m_s2: Noise = 0.3
 
 
 class FenceTable(_Table):
@@ -230,15 +257,19 @@ class PeersTable(_Table):
     range_m: Positive = 100.0
     digest: Annotated[int, Field(ge=0, le=30)] = 3
     """how many peers' latest samples a message carries"""
-    wait_s: Positive = 60.0
+    wait_s: Wait = 60.0
     """how long a vehicle in the air waits for the others"""
     missing: Literal["land", "continue"] = "land"
     """what it does then: land, or form with those that are up"""
-    isolated_flight_s: Positive = 5.0
+    isolated_flight_s: Wait = 5.0
     """how long a vehicle that hears nobody flies on before it holds"""
     network: Literal["laptop", "field"] = "laptop"
     scouting_port: Annotated[int, Field(ge=1024, le=65535)] | None = None
     """multicast port by which a laptop's vehicles find each other; None: from the fleet's name"""
+
+
+PadLimit = Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)]
+"""how far from its place a vehicle may be found: beyond a hundred metres it is another field"""
 
 
 class PreflightTable(_Table):
@@ -246,23 +277,24 @@ class PreflightTable(_Table):
 
     battery_min_percent: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)] = 30.0
     """0: not looked at"""
-    position_rate_min_hz: Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)] = 10.0
-    round_trip_limit_s: Annotated[float, Field(gt=0, le=10, allow_inf_nan=False)] = 0.25
-    """companion to autopilot and back"""
-    clock_limit_s: Annotated[float, Field(gt=0, le=10, allow_inf_nan=False)] = 0.1
-    """between any two companions"""
+    position_rate_min_hz: Annotated[float, Field(ge=5, le=1000, allow_inf_nan=False)] = 10.0
+    """slower, a vehicle at the speed limit flies a metre between two positions"""
+    round_trip_limit_s: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = 0.25
+    """companion to autopilot and back; beyond 0.3 s vehicles swing (`docs/limits.md`)"""
+    clock_limit_s: Annotated[float, Field(gt=0, le=0.5, allow_inf_nan=False)] = 0.1
+    """between any two companions; samples from a second ahead are refused, and plans are flown by the clock"""
     autopilot_clock_limit_s: Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)] = 6.0
     """between a companion and its autopilot; PX4 sets its clock by GPS only when it is off by 5 s"""
     origin_limit_m: Positive = 1000.0
     """estimators' origins from the fleet origin, and from each other"""
-    altitude_limit_m: Positive = 5.0
+    altitude_limit_m: PadLimit = 5.0
     """a vehicle on its pad, and its home, from the fleet origin's altitude"""
-    altitude_spread_m: Positive = 3.0
+    altitude_spread_m: PadLimit = 3.0
     """vehicles on their pads, and their homes, from each other"""
-    pad_limit_m: Positive = 10.0
+    pad_limit_m: PadLimit = 10.0
     """a vehicle from its own pad"""
-    offboard_loss_limit_s: Annotated[float, Field(gt=0, le=60, allow_inf_nan=False)] = 1.0
-    """the autopilot's COM_OF_LOSS_T"""
+    offboard_loss_limit_s: Annotated[float, Field(gt=0, le=5, allow_inf_nan=False)] = 1.0
+    """the autopilot's COM_OF_LOSS_T: for so long a vehicle flies on with its last setpoint"""
     require_rc: bool = False
     """whether every vehicle has a pilot with a transmitter"""
 
@@ -275,7 +307,7 @@ class FailsafeTable(_Table):
     """return: the whole fleet flies back over its pads and lands there"""
     battery_critical_percent: Percent = 12.0
     """land at once; 0 never"""
-    isolated_hold_s: Positive = 10.0
+    isolated_hold_s: Wait = 10.0
     """how long a vehicle that hears nobody stands before it lands"""
 
 
@@ -466,10 +498,49 @@ class FleetConfig(_Table):
         return max(self.r0_m, barrier) + SPACING_MARGIN_M
 
     @property
+    def range_min_m(self) -> float:
+        """Smallest range at which peers are looked at (m): a neighbour's distance, and what two at the speed limit that
+        fly at each other need to stop, after what the exchange takes."""
+        x = self.limits
+        speed = x.speed_max_m_s
+        braking_m = speed * self.peer_motion.latency_s + speed**2 / (2.0 * x.avoidance_acceleration_m_s2)
+        return self.formation.spacing_m + 2.0 * braking_m
+
+    @property
     def return_speed_m_s(self) -> float:
         """How fast the centre flies back over the pads, and the slots about it (m/s): both together within the plan's
         share of the limit."""
         return PLAN_SPEED_SHARE * self.limits.speed_max_m_s / 2
+
+    @property
+    def motion_limits(self) -> MotionLimits:
+        """What every motion must keep, whoever proposes it."""
+        x = self.limits
+        # Slots that change places by the assignment stay 1/sqrt(2) of their distance apart (`formation.assign`): with
+        # the offsets u before and w after of a pair u.w >= 0, since exchanging the two would else cost less.
+        apart_m = self.safety_radius_m / sqrt(2.0) if x.barrier else 0.0
+        return MotionLimits(x.speed_max_m_s, x.climb_max_m_s, x.descent_max_m_s, apart_m, self.geofence)
+
+    def motion_into(self, shape: str, motion: Motion, at_ns: int, issuer: int) -> Motion:
+        """The motion that takes over from `motion` with another formation.
+
+        The slots use what speed the centre leaves them, half of the limit at most.
+        """
+        x = self.limits
+        left = x.speed_max_m_s - top_speed_m_s(motion)
+        return with_formation(
+            motion, at_ns=at_ns, issuer=issuer, shape=shape, slots=self.slots(shape), pinned=self.pinned,
+            speed_m_s=max(min(left, x.speed_max_m_s / 2), (1.0 - PLAN_SPEED_SHARE) * x.speed_max_m_s),
+            climb_m_s=x.climb_max_m_s / 4, descent_m_s=x.descent_max_m_s / 4,
+        )  # fmt: skip
+
+    def motion_home(self, motion: Motion, at_ns: int, issuer: int) -> Motion:
+        """The motion that takes over from `motion` and brings every vehicle back over its own pad, to land."""
+        share = PLAN_SPEED_SHARE / 2
+        return with_return(
+            motion, self.first_motion, at_ns=at_ns, issuer=issuer, speed_m_s=self.return_speed_m_s,
+            climb_m_s=share * self.limits.climb_max_m_s, descent_m_s=share * self.limits.descent_max_m_s,
+        )  # fmt: skip
 
     @property
     def peer_limits(self) -> PeerLimits:
@@ -576,37 +647,41 @@ class FleetConfig(_Table):
             legs=(),
         )
 
-    def plan_legs(self, start: Ned) -> tuple[Leg, ...]:
-        """The plan's legs, begun at `start` (the centre, m)."""
-        return tuple(legs_from(self.plan.legs, start))
+    def plan_legs(self, start: Ned, velocity: Ned = ZERO) -> tuple[Leg, ...]:
+        """The plan's legs, begun at `start` with `velocity` (the centre's, m and m/s)."""
+        return tuple(self._legs(self.plan.legs, start, velocity))
+
+    def waypoint(self, start: Ned, velocity: Ned, table: GotoLegTable) -> Leg:
+        """The leg to a waypoint from a place and a velocity of the centre, within the vertical limits."""
+        x = self.limits
+        down = start.down if table.altitude_m is None else -table.altitude_m
+        return goto_leg(
+            start, velocity, Ned(table.north_m, table.east_m, down), table.speed_m_s,
+            PLAN_SPEED_SHARE * x.climb_max_m_s, PLAN_SPEED_SHARE * x.descent_max_m_s,
+        )  # fmt: skip
+
+    def _legs(self, tables: Sequence[LegTable], place: Ned, velocity: Ned) -> Iterator[Leg]:
+        """Legs of the core from their tables; how long a waypoint takes follows from where the leg before has led."""
+        for table in tables:
+            leg: Leg
+            match table:
+                case HoldLegTable():
+                    leg = VelocityLeg(ZERO, table.duration_s)
+                case VelocityLegTable():
+                    leg = VelocityLeg(Ned(table.north_m_s, table.east_m_s, -table.up_m_s), table.duration_s)
+                case TurnLegTable():
+                    angle = inf if table.angle_deg is None else radians(table.angle_deg)
+                    leg = TurnLeg(radians(table.rate_deg_s), angle)
+                case GotoLegTable():
+                    leg = self.waypoint(place, velocity, table)
+            yield leg
+            _, place, velocity, _ = leg_end(leg, place, velocity)
 
     @cached_property
     def shared_hash(self) -> str:
         """Digest of what the vehicles must agree on: everything but links and the stubs' noise."""
         shared = self.model_dump(exclude={"stub": True, "vehicle": {"__all__": {"mavlink", "zenoh"}}})
         return blake2s(json.dumps(shared, sort_keys=True).encode(), digest_size=8).hexdigest()
-
-
-def legs_from(tables: Sequence[LegTable], start: Ned) -> Iterator[Leg]:
-    """Legs of the core from their tables; a waypoint's duration follows from its distance."""
-    place = start
-    for table in tables:
-        match table:
-            case HoldLegTable():
-                yield VelocityLeg(ZERO, table.duration_s)
-            case VelocityLegTable():
-                velocity = Ned(table.north_m_s, table.east_m_s, -table.up_m_s)
-                yield VelocityLeg(velocity, table.duration_s)
-                place = Ned(*(p + v * table.duration_s for p, v in zip(place, velocity, strict=True)))
-            case TurnLegTable():
-                angle = inf if table.angle_deg is None else radians(table.angle_deg)
-                yield TurnLeg(radians(table.rate_deg_s), angle)
-            case GotoLegTable():
-                down = place.down if table.altitude_m is None else -table.altitude_m
-                target = Ned(table.north_m, table.east_m, down)
-                way = sqrt(sum((a - b) ** 2 for a, b in zip(place, target, strict=True)))
-                yield GotoLeg(target, goto_duration_s(way, table.speed_m_s))
-                place = target
 
 
 def companion_port(instance: int) -> int:
@@ -677,7 +752,7 @@ def parse(tables: Mapping[str, Any], name: str) -> FleetConfig:
         except ConfigError as error:
             faults.append(str(error))
         else:
-            faults += _outside_faults(config)
+            faults += _motion_faults(config)
     if faults:
         raise ConfigError("\n".join(f"{name}: {fault}" for fault in faults))
     return config
@@ -729,15 +804,19 @@ def _faults(config: FleetConfig) -> Iterator[str]:
             f"$.trigger.t_min_s must be below $.trigger.t_max_s = {config.trigger.t_max_s:g} s, "
             f"got {config.trigger.t_min_s:g}"
         )
+    if config.peers.range_m < config.range_min_m:
+        yield (
+            f"$.peers.range_m must be at least {config.range_min_m:.2f} m ($.formation.spacing_m, and twice the way of "
+            f"braking from $.limits.speed_max_m_s), got {config.peers.range_m:g}"
+        )
     yield from _plan_faults(config)
     if config.fence is not None:
         yield from _fence_faults(config.fence)
 
 
 def _plan_faults(config: FleetConfig) -> Iterator[str]:
-    """Legs that ask for more than the limits leave, or lead into the ground."""
+    """Legs that ask for more than the limits leave; what follows from the legs before is `_motion_faults`."""
     limits = config.limits
-    altitude_m = config.formation.altitude_m
     level = PLAN_SPEED_SHARE * limits.speed_max_m_s
     for k, leg in enumerate(config.plan.legs):
         where = f"$.plan.legs[{k}]"
@@ -752,9 +831,6 @@ def _plan_faults(config: FleetConfig) -> Iterator[str]:
                         f"{where}.up_m_s must be >= {least:g} and <= {most:g} m/s "
                         f"(3/4 of $.limits.descent_max_m_s and climb_max_m_s), got {leg.up_m_s:g}"
                     )
-                altitude_m += leg.up_m_s * leg.duration_s
-                if altitude_m < ALTITUDE_MIN_M:
-                    yield f"{where}: must end at least {ALTITUDE_MIN_M:g} m above the origin, got {altitude_m:g}"
             case TurnLegTable():
                 if abs(leg.rate_deg_s) < TURN_RATE_MIN_DEG_S:
                     yield f"{where}.rate_deg_s must be {TURN_RATE_MIN_DEG_S:g} deg/s or more, got {leg.rate_deg_s:g}"
@@ -766,7 +842,6 @@ def _plan_faults(config: FleetConfig) -> Iterator[str]:
                         f"{where}.speed_m_s must be <= {level:g} m/s (3/4 of $.limits.speed_max_m_s), "
                         f"got {leg.speed_m_s:g}"
                     )
-                altitude_m = altitude_m if leg.altitude_m is None else leg.altitude_m
     last = config.plan.legs[-1] if config.plan.legs else None
     if isinstance(last, VelocityLegTable) and last.up_m_s != 0.0 and config.plan.then == "stay":
         yield f"$.plan.legs[{len(config.plan.legs) - 1}].up_m_s must be 0 m/s in the last leg: it goes on for ever"
@@ -807,11 +882,46 @@ def _fence_faults(fence: FenceTable) -> Iterator[str]:
         yield f"$.fence.polygon_m must be wider than twice $.fence.margin_m = {fence.margin_m:g} m, got nothing inside"
 
 
-def _outside_faults(config: FleetConfig) -> Iterator[str]:
-    """Pads, formation and plan that are not inside the fence."""
+def _motion_faults(config: FleetConfig) -> Iterator[str]:
+    """Pads that are not inside the fence, and motions that the vehicles would refuse of each other: the way into the
+    formation, the plan, the way back."""
     fence = config.geofence
-    if fence is None:
+    if fence is not None:
+        yield from _pad_faults(config, fence)
+    if fence is not None and fence.vertical_room_m(-config.formation.altitude_m) < 0.0:
+        yield (
+            f"$.formation.altitude_m must be >= {-fence.lowest_down_m:g} and <= {-fence.highest_down_m:g} m "
+            f"(between floor and ceiling of the fence, less $.fence.vertical_margin_m), "
+            f"got {config.formation.altitude_m:g}"
+        )
         return
+    limits, first = config.motion_limits, config.first_motion
+    formed = config.motion_into(config.formation.shape, first, 0, 0)
+    fault = examine(formed, limits, first).fault
+    if fault is not None:
+        yield _formation_sentence(fault)
+        return
+    planned, start_ns = formed, formed.blend_end_ns
+    if config.plan.legs:
+        now = formed.moment(start_ns).centre
+        legs = config.plan_legs(now.position, now.velocity)
+        planned = with_legs(formed, at_ns=start_ns, issuer=0, legs=legs, then=config.plan.then)
+        fault = examine(planned, limits, formed).fault
+        if fault is not None:
+            yield _plan_sentence(fault)
+            return
+    if config.plan.then == "return" and planned.end_ns is not None:
+        fault = examine(config.motion_home(planned, planned.end_ns, 0), limits, planned).fault
+        if fault is not None and fault.breach is not None:
+            yield (
+                f'$.plan.then = "return": the way back from the last leg must stay inside the fence by its margin, '
+                f"got vehicle {fault.breach.vehicle_id} {fault.breach.outside_m:.2f} m beyond it"
+            )
+        elif fault is not None:
+            yield f'$.plan.then = "return": the way back from the last leg would be refused: {fault.sentence}'
+
+
+def _pad_faults(config: FleetConfig, fence: Fence) -> Iterator[str]:
     for v in config.vehicles:
         room = fence.edge_room_m(v.pad_north_m, v.pad_east_m)
         if room < 0.0:
@@ -819,45 +929,25 @@ def _outside_faults(config: FleetConfig) -> Iterator[str]:
                 f"$.vehicle[{v.instance}].pad_m must be inside the fence by $.fence.margin_m = {fence.margin_m:g} m, "
                 f"got [{v.pad_north_m:g}, {v.pad_east_m:g}], {-room:.2f} m too far out"
             )
-    if fence.vertical_room_m(-config.formation.altitude_m) < 0.0:
-        yield (
-            f"$.formation.altitude_m must be >= {-fence.lowest_down_m:g} and <= {-fence.highest_down_m:g} m "
-            f"(between floor and ceiling of the fence, less $.fence.vertical_margin_m), "
-            f"got {config.formation.altitude_m:g}"
-        )
-        return
-    formed = with_formation(
-        config.first_motion, at_ns=0, issuer=0, shape=config.formation.shape,
-        slots=config.slots(config.formation.shape), pinned=config.pinned,
-        speed_m_s=config.limits.speed_max_m_s / 2,
-    )  # fmt: skip
-    breach = first_breach(formed, fence)
-    if breach is not None:
-        yield (
-            f"$.formation: the slot of vehicle {breach.vehicle_id} must be inside the fence by its margin, "
-            f"got {breach.outside_m:.2f} m beyond it"
-        )
-        return
-    start_ns = formed.blend_end_ns
-    legs = config.plan_legs(formed.moment(start_ns).centre.position)
-    planned = with_legs(formed, at_ns=start_ns, issuer=0, legs=legs, then=config.plan.then)
-    breach = first_breach(planned, fence)
-    if breach is not None:
-        yield (
-            f"$.plan.legs[{breach.leg}] must stay inside the fence by its margin, "
-            f"got vehicle {breach.vehicle_id} {breach.outside_m:.2f} m beyond it {breach.time_s:.1f} s into the plan"
-        )
-        return
-    if config.plan.then == "return" and planned.end_ns is not None:
-        back = with_return(
-            planned, config.first_motion, at_ns=planned.end_ns, issuer=0, speed_m_s=config.return_speed_m_s
-        )
-        breach = first_breach(back, fence)
-        if breach is not None:
-            yield (
-                f'$.plan.then = "return": the way back from the last leg must stay inside the fence by its margin, '
-                f"got vehicle {breach.vehicle_id} {breach.outside_m:.2f} m beyond it"
-            )
+
+
+def _formation_sentence(fault: Fault) -> str:
+    if fault.breach is None:
+        return f"$.formation: the way into it would be refused: {fault.sentence}"
+    return (
+        f"$.formation: the slot of vehicle {fault.breach.vehicle_id} must be inside the fence by its margin, "
+        f"got {fault.breach.outside_m:.2f} m beyond it"
+    )
+
+
+def _plan_sentence(fault: Fault) -> str:
+    where = "$.plan" if fault.leg is None else f"$.plan.legs[{fault.leg}]"
+    if fault.breach is None or fault.breach.vehicle_id == 0:
+        return f"{where} would be refused: {fault.sentence.removeprefix(f'its leg {fault.leg} ')}"
+    return (
+        f"{where} must stay inside the fence by its margin, got vehicle {fault.breach.vehicle_id} "
+        f"{fault.breach.outside_m:.2f} m beyond it {fault.breach.time_s:.1f} s into the plan"
+    )
 
 
 _UNITS = {

@@ -16,19 +16,11 @@ from typing import Any, Protocol
 
 from pydantic import ValidationError
 
-from companion.config import FleetConfig
+from companion.config import FleetConfig, GotoLegTable
 from companion.core.frames import Ned
-from companion.core.plan import (
-    GotoLeg,
-    Leg,
-    Motion,
-    TurnLeg,
-    VelocityLeg,
-    goto_duration_s,
-    with_formation,
-    with_legs,
-    with_return,
-)
+from companion.core.motion_check import examine
+from companion.core.plan import Leg, Motion, TurnLeg, VelocityLeg, with_legs
+from companion.core.route import only_stops
 from companion.core.values import ZERO
 from companion.errors import RefusedError, WireError
 from companion.orders import ENDING, REVISION_JUMP_MAX, Place, read_place
@@ -292,23 +284,15 @@ class Operator:
     def rtl(self, now_ns: int) -> Answers:
         """Back over the pads, each vehicle over its own, and land there; RefusedError before the fleet has formed."""
         newest = self._formed(now_ns)
-        motion = with_return(
-            newest, self.config.first_motion, at_ns=self._start_ns(newest, now_ns), issuer=0,
-            speed_m_s=self.config.return_speed_m_s,
-        )  # fmt: skip
-        return self._send(motion)
+        return self._send(self.config.motion_home(newest, self._start_ns(newest, now_ns), 0), newest)
 
     def form(self, shape: str, now_ns: int) -> Answers:
         """Another formation; RefusedError if nobody says where the fleet is, ConfigError for an unknown shape."""
-        slots = self.config.slots(shape)
+        self.config.slots(shape)
         newest = self._formed(now_ns)
         # Slots that are still on their way to the last formation arrive there first.
         start_ns = max(self._start_ns(newest, now_ns), newest.blend_end_ns)
-        motion = with_formation(
-            newest, at_ns=start_ns, issuer=0, shape=shape, slots=slots,
-            pinned=self.config.pinned, speed_m_s=self.config.limits.speed_max_m_s / 2,
-        )  # fmt: skip
-        return self._send(motion)
+        return self._send(self.config.motion_into(shape, newest, start_ns, 0), newest)
 
     def move(self, leg: Leg, now_ns: int) -> Answers:
         """Another motion of the formation; RefusedError before it has formed by itself."""
@@ -316,17 +300,22 @@ class Operator:
         motion = with_legs(newest, at_ns=self._start_ns(newest, now_ns), issuer=0, legs=(leg,))
         if abs(motion.climb_at_end_m_s) > 1e-6:
             raise RefusedError("the formation would climb or sink for ever: give it a place and an altitude to go to")
-        return self._send(motion)
+        return self._send(motion, newest)
 
     def goto(self, north_m: float, east_m: float, altitude_m: float | None, speed_m_s: float, now_ns: int) -> Answers:
         """Fly the formation's centre to a point of the fleet frame and stop there."""
         newest = self._formed(now_ns)
         start_ns = self._start_ns(newest, now_ns)
-        here = newest.moment(start_ns).centre.position
-        target = Ned(north_m, east_m, here.down if altitude_m is None else -altitude_m)
-        way = sum((a - b) ** 2 for a, b in zip(here, target, strict=True)) ** 0.5
-        leg = GotoLeg(target, goto_duration_s(way, speed_m_s))
-        return self._send(with_legs(newest, at_ns=start_ns, issuer=0, legs=(leg,)))
+        here = newest.moment(start_ns).centre
+        try:
+            waypoint = GotoLegTable(
+                kind="goto", north_m=north_m, east_m=east_m, altitude_m=altitude_m, speed_m_s=speed_m_s
+            )
+        except ValidationError as error:
+            first = error.errors()[0]
+            raise RefusedError(f"goto: {first['loc'][0]}: {first['msg']}, got {first['input']!r}") from error
+        leg = self.config.waypoint(here.position, here.velocity, waypoint)
+        return self._send(with_legs(newest, at_ns=start_ns, issuer=0, legs=(leg,)), newest)
 
     def hold(self, clock_ns: Callable[[], int]) -> Answers:
         """Stop where the formation is; once more from what is newest then, if a vehicle has a newer motion or command.
@@ -375,7 +364,11 @@ class Operator:
     def _start_ns(self, newest: Motion, now_ns: int) -> int:
         return max(now_ns + COMMAND_LEAD_NS, newest.start_ns + 1)
 
-    def _send(self, motion: Motion) -> Answers:
+    def _send(self, motion: Motion, newest: Motion) -> Answers:
+        """Command a motion; RefusedError for one that every vehicle would refuse."""
+        fault = examine(motion, self.config.motion_limits, newest).fault
+        if fault is not None and not only_stops(motion, newest):
+            raise RefusedError(fault.sentence)
         return replace(self.command("motion", motion=json.loads(encode_motion(motion))), notes=self._left_out())
 
 

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from companion.config import FleetConfig, Vehicle
 from companion.core.frames import Geodetic, Ned, geodetic_to_ned
-from companion.core.plan import Motion, with_formation
+from companion.core.plan import Motion
 from companion.wire import mavlink as wire
 
 HEARTBEAT_LIMIT_S = 3.0
@@ -366,10 +366,7 @@ def unmet(checks: Iterable[Check]) -> list[Check]:
 
 def first_formation(config: FleetConfig, motion: Motion) -> Motion:
     """The change of formation that the vehicles begin with from a motion: pads to slots, as they assign them."""
-    return with_formation(
-        motion, at_ns=motion.start_ns, issuer=0, shape=config.formation.shape,
-        slots=config.slots(config.formation.shape), pinned=config.pinned, speed_m_s=config.limits.speed_max_m_s / 2,
-    )  # fmt: skip
+    return config.motion_into(config.formation.shape, motion, motion.start_ns, 0)
 
 
 def assignment_hash(config: FleetConfig) -> str:

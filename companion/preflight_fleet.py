@@ -11,9 +11,10 @@ from math import hypot, inf, sqrt
 from statistics import median
 from typing import Any
 
-from companion.config import ALTITUDE_MIN_M, PLAN_SPEED_SHARE, FleetConfig
+from companion.config import FleetConfig
 from companion.core.formation import minimum_distance
 from companion.core.frames import Ned
+from companion.core.motion_check import ALTITUDE_MIN_M, PLAN_SPEED_SHARE, SPEED_SLACK
 from companion.core.plan import Motion, top_speed_m_s, with_legs
 from companion.core.safety import DOWNWASH_RATIO
 from companion.core.values import ZERO
@@ -344,6 +345,6 @@ def _plan(config: FleetConfig) -> Iterator[Check]:
     fastest = top_speed_m_s(with_legs(start, at_ns=0, issuer=0, legs=legs)) if legs else ZERO.north
     most = PLAN_SPEED_SHARE * config.limits.speed_max_m_s
     yield Check(
-        "plan's speed", tidy(fastest), f"<= {most:g} m/s", fastest <= most * (1.0 + 1e-6),
+        "plan's speed", tidy(fastest), f"<= {most:g} m/s", fastest <= most * SPEED_SLACK,
         f"the plan flies at {fastest:.2f} m/s, may at {most:g} m/s", lasting=True,
     )  # fmt: skip

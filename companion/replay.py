@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from companion.agent import Agent
+from companion.border import Border
 from companion.config import parse
 from companion.core.failsafe import Failsafe
 from companion.core.values import Instant
@@ -74,6 +75,7 @@ def replay(agent: Agent, entries: Iterable[Entry], complete: bool = True) -> Rep
 
     Of a recording that is not complete (its process was killed) the last outputs may be missing.
     """
+    border = Border(agent)
     expected: list[tuple[str, bytes]] = []
     inputs = outputs = ticks = 0
     before: Entry | None = None
@@ -103,8 +105,8 @@ def replay(agent: Agent, entries: Iterable[Entry], complete: bool = True) -> Rep
             return ReplayResult(inputs, outputs, f"{_at(entry)}: replayed {channel} {body.hex()}, recorded nothing")
         inputs += 1
         try:
-            expected = list(INPUTS[entry.channel](agent, entry.body, entry.instant))
-        except Exception as error:  # noqa: BLE001 - the recorded agent went on, so that this one does not is a difference
+            expected = list(INPUTS[entry.channel](border, entry.body, entry.instant))
+        except Exception as error:  # noqa: BLE001 - an entry that is none: damaged, or of another version
             said = f"{type(error).__name__}: {error}"
             return ReplayResult(
                 inputs, outputs, f"{_at(entry)}: recorded {entry.channel}, on which replay raises {said}"
@@ -120,41 +122,41 @@ def _at(entry: Entry) -> str:
     return f"monotonic {entry.instant.monotonic_ns * 1e-9:.6f} s"
 
 
-def _advance(agent: Agent, _: bytes, now: Instant) -> Iterator[tuple[str, bytes]]:
-    out = agent.advance(now)
+def _advance(border: Border, _: bytes, now: Instant) -> Iterator[tuple[str, bytes]]:
+    out = border.advance(now)
     for datagram in out.mavlink:
         yield "output/mavlink", datagram
     for topic, payload in out.peers:
         yield "output/peer", topic.encode() + b"\0" + payload
 
 
-def _mavlink(agent: Agent, body: bytes, now: Instant) -> Iterator[tuple[str, bytes]]:
-    agent.receive_mavlink(body, now)
+def _mavlink(border: Border, body: bytes, now: Instant) -> Iterator[tuple[str, bytes]]:
+    border.receive_mavlink(body, now)
     return iter(())
 
 
-def _peer(agent: Agent, body: bytes, now: Instant) -> Iterator[tuple[str, bytes]]:
+def _peer(border: Border, body: bytes, now: Instant) -> Iterator[tuple[str, bytes]]:
     key, _, payload = body.partition(b"\0")
-    agent.receive_peer(key.decode(), payload, now)
+    border.receive_peer(key.decode(), payload, now)
     return iter(())
 
 
-def _presence(agent: Agent, body: bytes, now: Instant) -> Iterator[tuple[str, bytes]]:
-    agent.receive_presence(body[0], bool(body[1]), now)
+def _presence(border: Border, body: bytes, now: Instant) -> Iterator[tuple[str, bytes]]:
+    border.receive_presence(body[0], bool(body[1]), now)
     return iter(())
 
 
-def _command(agent: Agent, body: bytes, now: Instant) -> Iterator[tuple[str, bytes]]:
-    yield ANSWER, agent.receive_command(body, now)
+def _command(border: Border, body: bytes, now: Instant) -> Iterator[tuple[str, bytes]]:
+    yield ANSWER, border.receive_command(body, now)
 
 
-def _stop(agent: Agent, _: bytes, now: Instant) -> Iterator[tuple[str, bytes]]:
-    agent.stop(now)
+def _stop(border: Border, _: bytes, now: Instant) -> Iterator[tuple[str, bytes]]:
+    border.stop(now)
     return iter(())
 
 
-def _notice(agent: Agent, body: bytes, now: Instant) -> Iterator[tuple[str, bytes]]:
-    agent.notice(Failsafe[body.decode()], now)
+def _notice(border: Border, body: bytes, now: Instant) -> Iterator[tuple[str, bytes]]:
+    border.notice(Failsafe[body.decode()], now)
     return iter(())
 
 

@@ -13,7 +13,7 @@ barrier 2 v/p before the margin and brakes with p v/e at most.
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from math import e, hypot, inf, isfinite
+from math import e, hypot, inf, isfinite, sqrt
 from typing import NamedTuple
 
 from companion.core.frames import Ned
@@ -93,6 +93,58 @@ class Fence:
             return inf
         distance = min(foot[0] for foot in self._feet(north, east))
         return distance if self._within(north, east) else -distance
+
+    @cached_property
+    def convex(self) -> bool:
+        """Whether the straight way between two places inside is inside: of a cylinder, and of a polygon without notch.
+
+        Only then is the least room on a straight way that at one of its ends.
+        """
+        edges = self._edges
+        return all(a[2] * b[3] - a[3] * b[2] >= -1e-12 for a, b in zip(edges, (*edges[1:], *edges[:1]), strict=True))
+
+    def edge_room_along_m(self, a_north: float, a_east: float, b_north: float, b_east: float) -> float:
+        """Least room to the edge's margin on the straight way from a to b; minus infinity where the way leads over the
+        edge of a polygon with notches, or begins outside it."""
+        if self._edges and not self.convex:
+            return self._notched_room_along_m(a_north, a_east, b_north, b_east)
+        if self._edges:
+            # Inside, the nearest edge is that whose line is nearest; outside, the line is no further than the edge.
+            least = inf
+            for c_north, c_east, d_north, d_east, _ in self._edges:
+                a = (a_east - c_east) * d_north - (a_north - c_north) * d_east
+                b = (b_east - c_east) * d_north - (b_north - c_north) * d_east
+                least = min(least, a, b)
+            if least >= 0.0:
+                return least - self.margin_m
+        return min(self.edge_room_m(a_north, a_east), self.edge_room_m(b_north, b_east))
+
+    def _notched_room_along_m(self, a_north: float, a_east: float, b_north: float, b_east: float) -> float:
+        """Two ways that do not cross are nearest at an end of one of them."""
+        way_north, way_east = b_north - a_north, b_east - a_east
+        way2 = way_north * way_north + way_east * way_east
+        least2, within = inf, False
+        for c_north, c_east, d_north, d_east, length in self._edges:
+            ax, ay = a_north - c_north, a_east - c_east
+            bx, by = b_north - c_north, b_east - c_east
+            a_along, b_along = ax * d_north + ay * d_east, bx * d_north + by * d_east
+            a_left, b_left = ay * d_north - ax * d_east, by * d_north - bx * d_east
+            if (a_left > 0.0) != (b_left > 0.0):
+                crossing = a_along + a_left / (a_left - b_left) * (b_along - a_along)
+                if 0.0 <= crossing <= length:
+                    return -inf
+            end_east = c_east + length * d_east
+            if (c_east > a_east) != (end_east > a_east) and a_north < c_north + (a_east - c_east) * d_north / d_east:
+                within = not within
+            beyond = a_along - min(max(a_along, 0.0), length)
+            least2 = min(least2, beyond * beyond + a_left * a_left)
+            beyond = b_along - min(max(b_along, 0.0), length)
+            least2 = min(least2, beyond * beyond + b_left * b_left)
+            # The edge's start from the way; its end is the next edge's start.
+            share = min(max(-(ax * way_north + ay * way_east) / way2, 0.0), 1.0) if way2 > 0.0 else 0.0
+            x, y = ax + share * way_north, ay + share * way_east
+            least2 = min(least2, x * x + y * y)
+        return sqrt(least2) - self.margin_m if within else -inf
 
     def clearance_m(self, position_ned_m: Ned) -> float:
         """Distance to the nearest of edge, floor and ceiling; negative outside."""

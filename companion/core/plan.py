@@ -6,6 +6,7 @@ new one starts exactly where the one before has taken the formation. Motions are
 the largest wins, which is how vehicles without a leader agree on one of several proposals.
 """
 
+from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -18,13 +19,19 @@ from companion.core.values import ZERO
 
 PLAN_ACCELERATION_M_S2 = 0.5
 """the largest acceleration with which a leg changes the centre's velocity"""
+GOTO_ACCELERATION_M_S2 = 2 * PLAN_ACCELERATION_M_S2
+"""the largest acceleration of a goto leg, and of slots that change places"""
+GOTO_MIN_S = 1.0
+"""no goto leg is shorter"""
 PAD_TOLERANCE_M = 0.05
 TURN_RAMP_S = 3.0
 """time in which a turn's rate is built up and taken back"""
-SPEED_SAMPLES = 16
-"""moments of a leg without a steady course at which its speed is looked at"""
+GOTO_LOOKS = 64
+"""parts of a goto leg at whose ends its speed and acceleration are looked at: both are known to 0.1 %"""
 PADS = "pads"
 """name of the formation in which each vehicle is over its own pad"""
+MINIMUM_JERK_BEND = 5.7735
+"""peak of the second derivative of `minimum_jerk`; its slope's is 15/8"""
 Then = Literal["stay", "land", "return"]
 BLEND_MIN_S = 8.0
 """shortest time in which slots move from one formation to the next"""
@@ -86,17 +93,6 @@ class GotoLeg:
 Leg = VelocityLeg | TurnLeg | GotoLeg
 
 
-def goto_duration_s(distance_m: float, speed_m_s: float) -> float:
-    """Time for a rest-to-rest leg that keeps below a speed and twice PLAN_ACCELERATION_M_S2 (minimum jerk: peaks of
-    15/8 of the mean speed, 5.77 d/T^2)."""
-    return max(1.875 * distance_m / speed_m_s, sqrt(5.7735 * distance_m / (2 * PLAN_ACCELERATION_M_S2)), 1.0)
-
-
-def blend_duration_s(distance_m: float, speed_m_s: float) -> float:
-    """Time in which slots move `distance_m` at most: minimum jerk, below `speed_m_s` and 1 m/s^2, and 8 s at least."""
-    return max(BLEND_MIN_S, 1.875 * distance_m / speed_m_s, sqrt(5.7735 * distance_m))
-
-
 class _Centre(NamedTuple):
     position: Ned
     velocity: Ned
@@ -128,7 +124,7 @@ def _ramp_s(dv: Ned) -> float:
 
 def _turn_profile(leg: TurnLeg, t: float) -> tuple[float, float, float]:
     """Angle turned (rad), its rate and its acceleration at t; the rate rises and falls as a smoothstep."""
-    rate, whole = _turn_rate_and_time(leg)
+    rate, whole = turn_rate_and_time(leg)
     ramp = TURN_RAMP_S
 
     def rising(s: float) -> tuple[float, float, float]:
@@ -144,10 +140,10 @@ def _turn_profile(leg: TurnLeg, t: float) -> tuple[float, float, float]:
     return total - angle, now, -change
 
 
-def _turn_rate_and_time(leg: TurnLeg) -> tuple[float, float]:
+def turn_rate_and_time(leg: TurnLeg) -> tuple[float, float]:
     """Signed rate (rad/s) and whole duration (s): the rate's area under two ramps and the plateau is the angle."""
     rate = min(abs(leg.rate_rad_s), leg.angle_rad / TURN_RAMP_S)
-    return copysign(rate, leg.rate_rad_s), leg.angle_rad / rate + TURN_RAMP_S
+    return copysign(rate, leg.rate_rad_s), max(leg.angle_rad / abs(leg.rate_rad_s), TURN_RAMP_S) + TURN_RAMP_S
 
 
 @lru_cache(maxsize=16)
@@ -164,7 +160,7 @@ def _arc(leg: TurnLeg, v0: Ned, start: float, end: float) -> tuple[float, float]
 
 
 def _turn_leg(leg: TurnLeg, p0: Ned, v0: Ned, t: float) -> _Centre:
-    plateau, whole = _turn_rate_and_time(leg)
+    plateau, whole = turn_rate_and_time(leg)
     ramp = TURN_RAMP_S
     angle, rate, change = _turn_profile(leg, t)
     north, east = _arc(leg, v0, 0.0, min(t, ramp))
@@ -223,15 +219,123 @@ def fading(x: float) -> tuple[float, float, float]:
     )
 
 
+def _goto_looks() -> tuple[tuple[float, float, float, float], ...]:
+    """Slopes and curvatures of `minimum_jerk` and `fading` within a goto leg, where the first is steepest included."""
+    bend = sqrt(1.0 / 12.0)
+    places = [k / GOTO_LOOKS for k in range(1, GOTO_LOOKS)] + [0.5 - bend, 0.5 + bend]
+    return tuple((*minimum_jerk(x)[1:], *fading(x)[1:]) for x in places)
+
+
+_GOTO_LOOKS = _goto_looks()
+
+
+def goto_duration_s(
+    way: Ned, velocity: Ned, speed_m_s: float, climb_m_s: float = inf, descent_m_s: float = inf
+) -> float:
+    """Time of a goto leg over `way` (m) from `velocity` (m/s) whose greatest speed is `speed_m_s`.
+
+    The leg's velocity at x = t/T is way m'(x)/T + velocity f'(x) (`minimum_jerk`, `fading`), so at each x the condition
+    |v| <= speed is a quadratic in 1/T; the largest 1/T that meets all is the answer. It is smaller where the vertical
+    speeds or GOTO_ACCELERATION_M_S2 ask for it, and T at least GOTO_MIN_S. A leg that begins faster than `speed_m_s`
+    becomes no faster than it begins.
+    """
+    c = way.north**2 + way.east**2 + way.down**2
+    b = way.north * velocity.north + way.east * velocity.east + way.down * velocity.down
+    a = velocity.north**2 + velocity.east**2 + velocity.down**2
+    top2 = max(speed_m_s * speed_m_s, a)
+    climb, descent = max(climb_m_s, -velocity.down), max(descent_m_s, velocity.down)
+    per_s = 1.0 / GOTO_MIN_S
+    for m1, _, f1, _ in _GOTO_LOOKS:
+        if c > 1e-18:
+            free, along = top2 - a * f1 * f1, b * f1
+            root = sqrt(along * along + c * free)
+            per_s = min(per_s, free / (m1 * (root + along)) if along > 0.0 else (root - along) / (c * m1))
+        if way.down > 1e-9:
+            per_s = min(per_s, (descent - velocity.down * f1) / (way.down * m1))
+        elif way.down < -1e-9:
+            per_s = min(per_s, (climb + velocity.down * f1) / (-way.down * m1))
+
+    def acceleration2(s: float) -> float:
+        return max(s * s * (c * m2 * m2 * s * s + 2.0 * b * m2 * f2 * s + a * f2 * f2) for _, m2, _, f2 in _GOTO_LOOKS)
+
+    if acceleration2(per_s) > GOTO_ACCELERATION_M_S2**2:
+        least, most = 0.0, per_s
+        for _ in range(40):
+            middle = 0.5 * (least + most)
+            least, most = (least, middle) if acceleration2(middle) > GOTO_ACCELERATION_M_S2**2 else (middle, most)
+        per_s = least
+    return 1.0 / per_s
+
+
+def goto_leg(
+    start: Ned, velocity: Ned, target: Ned, speed_m_s: float, climb_m_s: float = inf, descent_m_s: float = inf
+) -> GotoLeg:
+    """A leg from a place and a velocity to a point, at `speed_m_s` at most (`goto_duration_s`)."""
+    way = Ned(target.north - start.north, target.east - start.east, target.down - start.down)
+    return GotoLeg(target, goto_duration_s(way, velocity, speed_m_s, climb_m_s, descent_m_s))
+
+
+class GotoPeaks(NamedTuple):
+    """The greatest level speed, climb, descent (m/s) and acceleration (m/s^2) of a goto leg, where it is looked at."""
+
+    level_m_s: float
+    climb_m_s: float
+    descent_m_s: float
+    acceleration_m_s2: float
+
+
+def goto_peaks(leg: GotoLeg, start: Ned, velocity: Ned) -> GotoPeaks:
+    """How fast a goto leg is flown from a place and a velocity."""
+    per_s = 1.0 / leg.duration_s
+    n, e, d = ((b - a) * per_s for a, b in zip(start, leg.target_ned_m, strict=True))
+    vn, ve, vd = velocity
+    level2, climb, descent, bend2 = vn * vn + ve * ve, max(-vd, 0.0), max(vd, 0.0), 0.0
+    for m1, m2, f1, f2 in _GOTO_LOOKS:
+        x, y, z = n * m1 + vn * f1, e * m1 + ve * f1, d * m1 + vd * f1
+        level2, climb, descent = max(level2, x * x + y * y), max(climb, -z), max(descent, z)
+        x, y, z = n * m2 + vn * f2, e * m2 + ve * f2, d * m2 + vd * f2
+        bend2 = max(bend2, x * x + y * y + z * z)
+    return GotoPeaks(sqrt(level2), climb, descent, sqrt(bend2) * per_s)
+
+
+def blend_duration_s(
+    changes: Sequence["SlotChange"], speed_m_s: float, climb_m_s: float = inf, descent_m_s: float = inf
+) -> float:
+    """Time in which slots change places: minimum jerk, below the speeds and 1 m/s^2, and BLEND_MIN_S at least."""
+    seconds = BLEND_MIN_S
+    for before, after in changes:
+        level, down = hypot(after.north - before.north, after.east - before.east), after.down - before.down
+        vertical = down / descent_m_s if down > 0.0 else -down / climb_m_s
+        seconds = max(
+            seconds, 1.875 * level / speed_m_s, 1.875 * vertical, sqrt(MINIMUM_JERK_BEND * dist(before, after))
+        )
+    return seconds
+
+
+def velocity_ramp_s(leg: VelocityLeg, v0: Ned) -> float:
+    """How long a velocity leg changes the velocity (s)."""
+    return _ramp_s(Ned(*(b - a for a, b in zip(v0, leg.velocity_ned_m_s, strict=True))))
+
+
 def leg_duration_s(leg: Leg, v0: Ned) -> float:
     """How long the leg lasts from the velocity v0 (m/s)."""
     match leg:
         case VelocityLeg():
-            return max(leg.duration_s, _ramp_s(Ned(*(b - a for a, b in zip(v0, leg.velocity_ned_m_s, strict=True)))))
+            return max(leg.duration_s, velocity_ramp_s(leg, v0))
         case TurnLeg():
-            return _turn_rate_and_time(leg)[1]
+            return turn_rate_and_time(leg)[1]
         case GotoLeg():
             return leg.duration_s
+
+
+def leg_end(leg: Leg, p0: Ned, v0: Ned) -> tuple[float, Ned, Ned, float]:
+    """Duration (s), place, velocity and angle turned at the end of a leg begun at p0 with v0; one without end ends
+    where it began."""
+    duration = leg_duration_s(leg, v0)
+    if duration == inf:
+        return inf, p0, v0, 0.0
+    end = _along(leg, p0, v0, duration)
+    return duration, end.position, end.velocity, end.turned
 
 
 def _along(leg: Leg, p0: Ned, v0: Ned, t: float) -> _Centre:
@@ -329,23 +433,28 @@ class Motion:
         return motion_order(self.revision, self.start_ns, self.issuer)
 
     @cached_property
-    def _starts(self) -> tuple[tuple[float, Ned, Ned, float], ...]:
-        """For each leg and the state after the last: (time since start, position, velocity, angle turned)."""
+    def leg_starts(self) -> tuple[tuple[float, Ned, Ned, float], ...]:
+        """For each leg and the state after the last: (time since the legs' start, position, velocity, angle turned).
+
+        What follows a leg without end is left out, and the last time is infinite.
+        """
         rows = [(0.0, self.centre_ned_m, self.velocity_ned_m_s, 0.0)]
         for leg in self.legs:
             t, p, v, turned = rows[-1]
-            duration = leg_duration_s(leg, v)
+            duration, p, v, angle = leg_end(leg, p, v)
+            rows.append((t + duration, p, v, turned + angle))
             if duration == inf:
-                rows.append((inf, p, v, turned))
                 break
-            end = _along(leg, p, v, duration)
-            rows.append((t + duration, end.position, end.velocity, turned + end.turned))
         return tuple(rows)
+
+    @cached_property
+    def _times(self) -> list[float]:
+        return [row[0] for row in self.leg_starts]
 
     @property
     def end_ns(self) -> int | None:
         """Fleet time at which the last leg and the blend are over; None for a motion without end."""
-        last = self._starts[-1][0]
+        last = self.leg_starts[-1][0]
         if last == inf:
             return None
         return max(self.legs_start_ns + round(last * 1e9), self.blend_end_ns)
@@ -363,18 +472,15 @@ class Motion:
     @property
     def climb_at_end_m_s(self) -> float:
         """Vertical speed of the centre with which the motion goes on for ever (m/s, up)."""
-        return -self._starts[-1][2].down
+        return -self.leg_starts[-1][2].down
 
     def activity(self, fleet_ns: int) -> Literal["none", "legs", "rest"]:
         """What the legs do at a time: there are none, they run, or the centre rests after or within them."""
         if not self.legs:
             return "none"
         t = (fleet_ns - self.legs_start_ns) * 1e-9
-        starts = self._starts
-        k = 0
-        while k + 1 < len(starts) and t >= starts[k + 1][0]:
-            k += 1
-        since, _, v, _ = starts[k]
+        k = max(bisect_right(self._times, t) - 1, 0)
+        since, _, v, _ = self.leg_starts[k]
         if k >= len(self.legs):
             return "rest" if v == ZERO else "legs"
         leg = self.legs[k]
@@ -384,11 +490,8 @@ class Motion:
     def moment(self, fleet_ns: int) -> Moment:
         """The centre, the heading and the blend at a time; before the legs' start the centre's velocity is constant."""
         t = (fleet_ns - self.legs_start_ns) * 1e-9
-        starts = self._starts
-        k = 0
-        while k + 1 < len(starts) and t >= starts[k + 1][0]:
-            k += 1
-        since, p, v, turned = starts[k]
+        k = max(bisect_right(self._times, t) - 1, 0)
+        since, p, v, turned = self.leg_starts[k]
         if t < 0.0 or k >= len(self.legs):
             dt = t - since
             now = _Centre(
@@ -464,7 +567,16 @@ def with_legs(
 
 
 def with_formation(
-    motion: Motion, *, at_ns: int, issuer: int, shape: str, slots: Slots, pinned: Mapping[int, int], speed_m_s: float
+    motion: Motion,
+    *,
+    at_ns: int,
+    issuer: int,
+    shape: str,
+    slots: Slots,
+    pinned: Mapping[int, int],
+    speed_m_s: float,
+    climb_m_s: float = inf,
+    descent_m_s: float = inf,
 ) -> Motion:
     """The motion that takes over from `motion` at `at_ns` with its vehicles moving to other slots.
 
@@ -475,21 +587,29 @@ def with_formation(
     ids = sorted(motion.slots)
     before = [Ned(*(a + m * (b - a) for a, b in zip(*motion.slots[i], strict=True))) for i in ids]
     order = assign(before, slots, _rows(ids, pinned))
-    after = [slots[k] for k in order]
-    way = max((dist(a, b) for a, b in zip(before, after, strict=True)), default=0.0)
+    changes = [SlotChange(a, slots[k]) for a, k in zip(before, order, strict=True)]
     return replace(
         motion,
         revision=motion.revision + 1,
         start_ns=at_ns,
         issuer=issuer,
         shape=shape,
-        slots={i: SlotChange(a, b) for i, a, b in zip(ids, before, after, strict=True)},
+        slots=dict(zip(ids, changes, strict=True)),
         blend_start_ns=at_ns,
-        blend_s=blend_duration_s(way, speed_m_s),
+        blend_s=blend_duration_s(changes, speed_m_s, climb_m_s, descent_m_s),
     )
 
 
-def with_return(motion: Motion, home: Motion, *, at_ns: int, issuer: int, speed_m_s: float) -> Motion:
+def with_return(
+    motion: Motion,
+    home: Motion,
+    *,
+    at_ns: int,
+    issuer: int,
+    speed_m_s: float,
+    climb_m_s: float = inf,
+    descent_m_s: float = inf,
+) -> Motion:
     """The motion that takes over from `motion` at `at_ns` and brings every vehicle back over its own pad, to land.
 
     `home` is the first motion, in which each stands over its pad. The centre flies to the pads' centre while the slots
@@ -506,11 +626,8 @@ def with_return(motion: Motion, home: Motion, *, at_ns: int, issuer: int, speed_
         north, east, down = (x - y for x, y in zip(pad, centre, strict=True))
         before = Ned(*(x + here.blend[0] * (y - x) for x, y in zip(a, b, strict=True)))
         slots[i] = SlotChange(before, Ned(c * north + s * east, c * east - s * north, down))
-    way = max(dist(*change) for change in slots.values())
-    flown_m = dist(here.centre.position, centre)
-    # A centre that still flies away comes to rest first: as much more way as its stopping takes.
-    flown_m += hypot(*here.centre.velocity) ** 2 / (2 * PLAN_ACCELERATION_M_S2)
-    seconds = max(blend_duration_s(way, speed_m_s), goto_duration_s(flown_m, speed_m_s))
+    flight = goto_leg(here.centre.position, here.centre.velocity, centre, speed_m_s, climb_m_s, descent_m_s)
+    seconds = max(blend_duration_s(list(slots.values()), speed_m_s, climb_m_s, descent_m_s), flight.duration_s)
     return replace(
         stopped, shape=PADS, slots=slots, blend_start_ns=at_ns, blend_s=seconds,
         legs=(GotoLeg(centre, seconds),), then="land",
@@ -552,18 +669,15 @@ def _rows(ids: Sequence[int], pinned: Mapping[int, int]) -> dict[int, int]:
 
 
 def top_speed_m_s(motion: Motion) -> float:
-    """The centre's greatest level speed over the motion (m/s), looked for at the legs' ends and inside them."""
-    v = motion.velocity_ned_m_s
+    """The centre's greatest level speed over the motion (m/s)."""
+    _, _, v, _ = motion.leg_starts[0]
     fastest = hypot(v.north, v.east)
-    since = 0.0
-    for leg in motion.legs:
-        duration = leg_duration_s(leg, v)
-        parts = SPEED_SAMPLES if isinstance(leg, GotoLeg) else 1
-        # The velocity of an endless turn changes its direction only.
-        for k in range(1, parts + 1 if duration < inf else 1):
-            v = motion.moment(motion.legs_start_ns + round((since + duration * k / parts) * 1e9)).centre.velocity
-            fastest = max(fastest, hypot(v.north, v.east))
-        since += duration
+    for leg, (_, p, v, _) in zip(motion.legs, motion.leg_starts, strict=False):
+        if isinstance(leg, GotoLeg):
+            fastest = max(fastest, goto_peaks(leg, p, v).level_m_s)
+        elif isinstance(leg, VelocityLeg):
+            # Between two velocities none is faster than both; a turn changes the direction only.
+            fastest = max(fastest, hypot(leg.velocity_ned_m_s.north, leg.velocity_ned_m_s.east))
     return fastest
 
 

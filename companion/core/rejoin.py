@@ -1,10 +1,9 @@
 """The own reference of a vehicle that is apart from the formation: it stands, then comes back to its slot smoothly."""
 
 from dataclasses import dataclass
-from math import dist
 
 from companion.core.frames import Ned
-from companion.core.plan import Reference, blend_duration_s, fading, minimum_jerk
+from companion.core.plan import Reference, SlotChange, blend_duration_s, fading, minimum_jerk
 from companion.core.values import ZERO
 
 
@@ -28,7 +27,8 @@ class OwnWay:
         """Set out from the own reference towards the slot's."""
         self._offset = _minus(own.position_ned_m, slot.position_ned_m)
         self._velocity = _minus(own.velocity_ned_m_s, slot.velocity_ned_m_s)
-        self._seconds = blend_duration_s(dist(own.position_ned_m, slot.position_ned_m), speed_m_s)
+        way = SlotChange(own.position_ned_m, slot.position_ned_m)
+        self._seconds = blend_duration_s([way], speed_m_s, speed_m_s, speed_m_s)
         self.start_ns = fleet_ns
 
     def reference(self, slot: Reference, fleet_ns: int) -> Reference:

@@ -1,27 +1,47 @@
-"""Whether a motion stays within the fence: for fleet.toml, for preflight, and for what an operator commands.
+"""Whether a motion stays within the fence, found with few looks.
 
-A motion is looked at from its start to the end of its last leg and of its change of formation; a turn without end for
+A motion is examined from its start to the end of its last leg and of its change of formation; a turn without end for
 one whole turn. What may follow for ever (a velocity that is kept) is left to the safety filter, which brakes.
+
+Between two looks a slot whose acceleration is at most a strays from the straight way by at most a t^2/8. So a straight
+leg takes two looks however long it is, and a curve is halved only where its strip reaches the margin, down to
+RESOLUTION_M. The work is counted in looks and ends at LOOKS_MAX: a motion that needs more is refused.
 """
 
 from collections.abc import Iterator
-from math import dist, hypot, inf, pi
+from dataclasses import dataclass, field
+from math import dist, hypot, inf, isfinite, pi
 from typing import NamedTuple
 
 from companion.core.fence import Fence
-from companion.core.plan import TURN_RAMP_S, Motion, TurnLeg, VelocityLeg, leg_duration_s
+from companion.core.frames import Ned
+from companion.core.plan import (
+    MINIMUM_JERK_BEND,
+    PLAN_ACCELERATION_M_S2,
+    TURN_RAMP_S,
+    GotoLeg,
+    Moment,
+    Motion,
+    SlotChange,
+    TurnLeg,
+    VelocityLeg,
+    leg_duration_s,
+    turn_rate_and_time,
+    velocity_ramp_s,
+)
 from companion.core.values import ZERO
 
-STEP_M = 0.25
-"""shortest way between two looks"""
-OUTSIDE_STEP = 1.0 / 16.0
-"""outside, the way to the next look is this part of the depth, so that the worst is told to some per cent"""
-LOOKS_MAX = 4000
-"""most looks at one leg: a leg of weeks beside the edge must not stop a vehicle"""
+RESOLUTION_M = 0.01
+"""a breach between two looks that is no deeper than this may be missed"""
+LOOKS_MAX = 1400
+"""most looks at a motion of up to ten vehicles; of more vehicles more, up to three times as many"""
+SLOT_LOOKS = 0.25
+"""cost of one slot's place over that of a look at the centre"""
+EDGE_LOOKS, NOTCHED_EDGE_LOOKS = 0.1, 0.25
+"""cost of one edge of a polygon over that of the place"""
+DEPTH_PARTS = 24
+"""a leg that leads outside is looked at in so many parts, and its worst part again, to tell how far it leads"""
 TOLERANCE_M = 1e-6
-SPEED_LOOKS = 16
-SPEED_ALLOWANCE = 1.1
-"""speeds are looked at in so many moments of a leg; between them they may be this much higher"""
 
 
 class Breach(NamedTuple):
@@ -30,6 +50,7 @@ class Breach(NamedTuple):
     leg: int | None
     """index of the leg; None: before the first leg or after the last, while slots change places"""
     vehicle_id: int
+    """0: nobody leads outside, but the motion takes more looks than it may"""
     outside_m: float
     """how far beyond the margin that leg leads at most"""
     time_s: float
@@ -38,136 +59,292 @@ class Breach(NamedTuple):
     def sentence(self) -> str:
         """For people, as the rest of a sentence about the motion."""
         where = "its formation" if self.leg is None else f"its leg {self.leg}"
+        if self.vehicle_id == 0:
+            return f"{where} takes too many looks beside the fence: fly fewer legs, or further inside"
         return f"{where} takes vehicle {self.vehicle_id} {self.outside_m:.2f} m beyond the fence's margin"
 
 
-class _Stretch(NamedTuple):
+class _Span(NamedTuple):
+    """A time in which a motion is smooth, with bounds on what bends its slots' ways."""
+
     leg: int | None
     start_ns: int
     end_ns: int
+    centre_m_s2: float
+    """no greater is the centre's acceleration"""
+    straight: bool
+    """whether the centre's way is straight, without turning back, at whatever pace"""
+    rate_rad_s: float
+    """nor the heading's rate"""
+    rate_change_rad_s2: float
 
 
-def _stretches(motion: Motion) -> Iterator[_Stretch]:
-    """The legs' times, none longer than it tells anything new, and what the change of formation takes besides."""
-    now_ns = motion.legs_start_ns
-    if now_ns > motion.start_ns:
-        yield _Stretch(None, motion.start_ns, now_ns)
-    v = motion.velocity_ned_m_s
-    for k, leg in enumerate(motion.legs):
-        duration = leg_duration_s(leg, v)
-        since_ns = max(now_ns, motion.start_ns)
-        if isinstance(leg, TurnLeg):
-            # Of many turns the first and the last: those between are the same circle.
-            once_ns = round((2.0 * pi / abs(leg.rate_rad_s) + 2.0 * TURN_RAMP_S) * 1e9)
+def _leg_spans(motion: Motion, k: int, since_ns: int) -> Iterator[_Span]:
+    """A leg's parts, none longer than it tells anything new; since_ns is when it begins."""
+    leg, (_, p, v, _) = motion.legs[k], motion.leg_starts[k]
+    duration = leg_duration_s(leg, v)
+    match leg:
+        case VelocityLeg():
+            ramp_ns = since_ns + round(velocity_ramp_s(leg, v) * 1e9)
+            yield _Span(k, since_ns, ramp_ns, PLAN_ACCELERATION_M_S2, _aligned(v, leg.velocity_ned_m_s), 0.0, 0.0)
+            if duration < inf:
+                yield _Span(k, ramp_ns, since_ns + round(duration * 1e9), 0.0, True, 0.0, 0.0)
+        case GotoLeg():
+            bend = MINIMUM_JERK_BEND * dist(p, leg.target_ned_m) / duration**2 + 4.0 * hypot(*v) / duration
+            yield _Span(k, since_ns, since_ns + round(duration * 1e9), bend, v == ZERO, 0.0, 0.0)
+        case TurnLeg():
+            rate = abs(turn_rate_and_time(leg)[0])
+            turning = rate if motion.heading_follows_turns else 0.0
+            ramp = (rate * hypot(v.north, v.east), False, turning, 1.5 * turning / TURN_RAMP_S)
+            steady = (*ramp[:3], 0.0)
+            from_ns, once_ns = since_ns + round(TURN_RAMP_S * 1e9), round(2.0 * pi / rate * 1e9)
+            yield _Span(k, since_ns, from_ns, *ramp)
+            # Of many turns the first and the last: those between are the same circle, once the slots are there.
+            once_ns = max(from_ns, motion.start_ns, motion.blend_end_ns) + once_ns - from_ns
             if duration == inf:
-                yield _Stretch(k, since_ns, since_ns + once_ns)
+                yield _Span(k, from_ns, from_ns + once_ns, *steady)
                 return
-            end_ns = now_ns + round(duration * 1e9)
-            if end_ns - since_ns > 2 * once_ns:
-                yield _Stretch(k, since_ns, since_ns + once_ns)
-                since_ns = end_ns - once_ns
-        end_ns = now_ns + round(duration * 1e9)
-        v = motion.moment(end_ns).centre.velocity
-        if end_ns >= since_ns:
-            yield _Stretch(k, since_ns, end_ns)
-        now_ns = end_ns
-    if motion.blend_end_ns > now_ns or not motion.legs:
-        start_ns = max(now_ns, motion.start_ns)
-        yield _Stretch(None, start_ns, max(motion.blend_end_ns, start_ns))
+            end_ns = since_ns + round(duration * 1e9)
+            until_ns = end_ns - round(TURN_RAMP_S * 1e9)
+            if until_ns - from_ns > 2 * once_ns:
+                yield _Span(k, from_ns, from_ns + once_ns, *steady)
+                from_ns = until_ns - once_ns
+            yield _Span(k, from_ns, until_ns, *steady)
+            yield _Span(k, until_ns, end_ns, *ramp)
 
 
-class _Extent(NamedTuple):
-    """How far slots reach from the centre, level, and down between two values; the longest way of a change (m)."""
-
-    level_m: float
-    least_down_m: float
-    most_down_m: float
-    way_m: float
-
-
-def _extent(motion: Motion) -> _Extent:
-    ends = [slot for change in motion.slots.values() for slot in change]
-    downs = [s.down for s in ends]
-    way = max(dist(change.before, change.after) for change in motion.slots.values())
-    return _Extent(max(hypot(s.north, s.east) for s in ends), min(downs), max(downs), way)
-
-
-def _speeds(motion: Motion, extent: _Extent, stretch: _Stretch) -> tuple[float, float]:
-    """No slot's level and vertical speed is greater over a stretch (m/s)."""
-    span = stretch.end_ns - stretch.start_ns
-    level = vertical = 0.0
-    for k in range(SPEED_LOOKS + 1):
-        now = motion.moment(stretch.start_ns + span * k // SPEED_LOOKS)
-        v, changing = now.centre.velocity, abs(now.blend[1]) * extent.way_m
-        level = max(level, hypot(v.north, v.east) + abs(now.rate) * extent.level_m + changing)
-        vertical = max(vertical, abs(v.down) + changing)
-    return SPEED_ALLOWANCE * level + 0.01, SPEED_ALLOWANCE * vertical + 0.01
+def _spans(motion: Motion) -> Iterator[_Span]:
+    """The legs from the motion's start on, and what the change of formation takes besides."""
+    now_ns = motion.start_ns
+    for k, (since, _, _, _) in enumerate(motion.leg_starts):
+        if since == inf:
+            return
+        since_ns = motion.legs_start_ns + round(since * 1e9)
+        if k == 0 and since_ns > now_ns:
+            yield _Span(None, now_ns, since_ns, 0.0, True, 0.0, 0.0)
+        if k == len(motion.legs):
+            now_ns = max(since_ns, motion.start_ns)
+            break
+        for span in _leg_spans(motion, k, since_ns):
+            if span.end_ns >= motion.start_ns:
+                yield span._replace(start_ns=max(span.start_ns, motion.start_ns))
+    yield _Span(None, now_ns, max(motion.blend_end_ns, now_ns), 0.0, True, 0.0, 0.0)
 
 
-def _room(motion: Motion, fence: Fence, extent: _Extent, fleet_ns: int) -> tuple[float, float, int]:
-    """Room that is left to every slot at a time: level, vertical, and the vehicle that has least of both.
+def _aligned(a: Ned, b: Ned) -> bool:
+    """Whether two velocities have one direction, or one of them is none."""
+    across = (
+        a.north * b.east - a.east * b.north,
+        a.east * b.down - a.down * b.east,
+        a.down * b.north - a.north * b.down,
+    )
+    return across == (0.0, 0.0, 0.0) and a.north * b.north + a.east * b.east + a.down * b.down >= 0.0
 
-    Where the centre has more level room than the slots reach, that is the answer: their places are not looked at.
-    """
-    moment = motion.moment(fleet_ns)
-    north, east, down = moment.centre.position
-    level = fence.edge_room_m(north, east) - extent.level_m
-    vertical = min(fence.vertical_room_m(down + extent.least_down_m), fence.vertical_room_m(down + extent.most_down_m))
-    if level >= 0.0 and vertical >= 0.0:
-        return level, vertical, 0
-    level, vertical, least, vehicle = inf, inf, inf, 0
-    for i, change in motion.slots.items():
-        place = moment.slot(change).position_ned_m
-        edge, height = fence.edge_room_m(place.north, place.east), fence.vertical_room_m(place.down)
-        level, vertical = min(level, edge), min(vertical, height)
-        if min(edge, height) < least:
-            least, vehicle = min(edge, height), i
-    return level, vertical, vehicle
+
+@dataclass(slots=True)
+class _March:
+    """One examination of a motion."""
+
+    motion: Motion
+    fence: Fence
+    allowed_m: float = 0.0
+    """room that no slot may fall below"""
+    looks: float = 0.0
+    _level_m: float = field(init=False)
+    """how far slots reach from the centre, level, before or after their change"""
+    _least_down_m: float = field(init=False)
+    _most_down_m: float = field(init=False)
+    _way_m: float = field(init=False)
+    """the longest way of a change"""
+    _looks_max: float = field(init=False)
+    _centre_cost: float = field(init=False)
+    _slots_cost: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        ends = [slot for change in self.motion.slots.values() for slot in change]
+        self._level_m = max(hypot(s.north, s.east) for s in ends)
+        self._least_down_m, self._most_down_m = min(s.down for s in ends), max(s.down for s in ends)
+        self._way_m = max(dist(*change) for change in self.motion.slots.values())
+        count = len(self.motion.slots)
+        edges = len(self.fence.corners_m) * (EDGE_LOOKS if self.fence.convex else NOTCHED_EDGE_LOOKS)
+        self._looks_max = LOOKS_MAX * min(max(count / 10.0, 1.0), 3.0)
+        self._centre_cost = 1.0 + SLOT_LOOKS * edges
+        self._slots_cost = SLOT_LOOKS * count * (1.0 + edges)
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether the looks are used up."""
+        return self.looks > self._looks_max
+
+    def least_room(self, fleet_ns: int) -> tuple[float, int]:
+        """Least room of any slot at a time, and the vehicle that has it."""
+        moment = self.motion.moment(fleet_ns)
+        self.looks += self._slots_cost
+        least, vehicle = inf, 0
+        for i, change in self.motion.slots.items():
+            room = self.fence.room_m(moment.slot(change).position_ned_m)
+            if room < least:
+                least, vehicle = room, i
+        return least, vehicle
+
+    def _bend_m_s2(self, span: _Span, start_ns: int, end_ns: int) -> float:
+        """No slot's acceleration is greater between two times of a span; 0 where all ways are straight."""
+        m, bend = self.motion, 0.0
+        rate, change = span.rate_rad_s, span.rate_change_rad_s2
+        if m.heading_rate_rad_s != 0.0 and start_ns - m.legs_start_ns < TURN_RAMP_S * 1e9:
+            rate += abs(m.heading_rate_rad_s)
+            change += 1.5 * abs(m.heading_rate_rad_s) / TURN_RAMP_S
+        bend = (change + rate * rate) * self._level_m
+        if m.blend_s > 0.0 and start_ns < m.blend_end_ns and end_ns > m.blend_start_ns:
+            bend += (2.0 * rate * 1.875 / m.blend_s + MINIMUM_JERK_BEND / m.blend_s**2) * self._way_m
+        # Slots that are rigidly about a centre on a straight way fly straight; others do not, at an uneven pace.
+        return 0.0 if bend == 0.0 and span.straight else bend + span.centre_m_s2
+
+    def inside(self, span: _Span) -> bool:
+        """Whether every slot stays inside over a span; also False once the looks are used up."""
+        moment = self.motion.moment
+        stack = [(span.start_ns, moment(span.start_ns), span.end_ns, moment(span.end_ns))]
+        while stack:
+            start_ns, first, end_ns, last = stack.pop()
+            self.looks += self._centre_cost
+            if self.exhausted:
+                return False
+            seconds = (end_ns - start_ns) * 1e-9
+            strip = 0.125 * self._bend_m_s2(span, start_ns, end_ns) * seconds * seconds
+            if self._all_inside(first, last, strip):
+                continue
+            least, wide = self._slots_inside(first, last, strip)
+            if least >= self.allowed_m:
+                continue
+            if not self._ends_inside(first, last):
+                return False
+            middle_ns = (start_ns + end_ns) // 2
+            if wide > RESOLUTION_M and start_ns < middle_ns < end_ns:
+                middle = moment(middle_ns)
+                stack += [(middle_ns, middle, end_ns, last), (start_ns, first, middle_ns, middle)]
+        return True
+
+    def _all_inside(self, first: Moment, last: Moment, strip: float) -> bool:
+        """Whether a strip about the centre's way that is wide enough for every slot is inside."""
+        a, b = first.centre.position, last.centre.position
+        fence, need = self.fence, self.allowed_m + strip
+        return (
+            min(
+                fence.vertical_room_m(a.down + self._least_down_m), fence.vertical_room_m(a.down + self._most_down_m),
+                fence.vertical_room_m(b.down + self._least_down_m), fence.vertical_room_m(b.down + self._most_down_m),
+            ) >= need
+            and fence.edge_room_along_m(a.north, a.east, b.north, b.east) - self._level_m >= need
+        )  # fmt: skip
+
+    def _slots_inside(self, first: Moment, last: Moment, strip: float) -> tuple[float, float]:
+        """Least room of the strips about the slots' ways, and how wide or (beside a notch) how long what may be halved
+        is."""
+        self.looks += 2.0 * self._slots_cost
+        fence, convex = self.fence, self.fence.convex
+        least, wide = inf, strip
+        for change in self.motion.slots.values():
+            a, b = first.slot(change).position_ned_m, last.slot(change).position_ned_m
+            least = min(
+                least, fence.vertical_room_m(a.down), fence.vertical_room_m(b.down),
+                fence.edge_room_along_m(a.north, a.east, b.north, b.east),
+            )  # fmt: skip
+            if not convex:
+                wide = max(wide, hypot(b.north - a.north, b.east - a.east))
+        return least - strip, wide
+
+    def _ends_inside(self, first: Moment, last: Moment) -> bool:
+        self.looks += self._slots_cost
+        return all(
+            self.fence.room_m(moment.slot(change).position_ned_m) >= self.allowed_m
+            for change in self.motion.slots.values()
+            for moment in (first, last)
+        )
+
+    def deepest(self, spans: list[_Span]) -> Breach | None:
+        """How far the spans of one leg lead outside at most."""
+        worst: Breach | None = None
+        start_ns, end_ns = spans[0].start_ns, spans[-1].end_ns
+        for _ in range(2):
+            step_ns = max((end_ns - start_ns) // DEPTH_PARTS, 1)
+            for at_ns in (*range(start_ns, end_ns, step_ns), end_ns):
+                room, vehicle = self.least_room(at_ns)
+                if room < self.allowed_m and (worst is None or -room > worst.outside_m):
+                    worst = Breach(spans[0].leg, vehicle, -room, (at_ns - self.motion.start_ns) * 1e-9)
+            if worst is None:
+                return None
+            at_ns = self.motion.start_ns + round(worst.time_s * 1e9)
+            start_ns, end_ns = max(at_ns - step_ns, start_ns), min(at_ns + step_ns, end_ns)
+        return worst
 
 
 def first_breach(motion: Motion, fence: Fence | None) -> Breach | None:
     """The first leg that leads a slot beyond the fence's margin, with the worst of that leg; None if all stay inside.
 
-    The motion is marched along: the next look is when a slot could first touch the margin, and at least STEP_M on. A
-    motion that starts beyond the margin is a way back if it ends no further out, whatever it passes: the safety filter
-    holds the vehicles meanwhile.
+    A motion that starts beyond the margin is a way back if it ends no further out, whatever it passes: the safety
+    filter holds the vehicles meanwhile.
     """
-    if fence is None or not motion.slots:
-        return None
-    extent = _extent(motion)
-    stretches = list(_stretches(motion))
-    level, vertical, _ = _room(motion, fence, extent, motion.start_ns)
-    allowed = min(level, vertical, 0.0) - TOLERANCE_M
-    if allowed < -2.0 * TOLERANCE_M:
-        end = stretches[-1]
-        level, vertical, vehicle = _room(motion, fence, extent, end.end_ns)
-        room = min(level, vertical)
-        return Breach(end.leg, vehicle, -room, (end.end_ns - motion.start_ns) * 1e-9) if room < allowed else None
-    for stretch in stretches:
-        worst = _worst(motion, fence, extent, stretch, allowed)
-        if worst is not None:
-            return worst
-    return None
+    return None if fence is None or not motion.slots else examined(motion, fence)[0]
 
 
-def _worst(motion: Motion, fence: Fence, extent: _Extent, stretch: _Stretch, allowed_m: float) -> Breach | None:
-    level_m_s, vertical_m_s = _speeds(motion, extent, stretch)
-    worst: Breach | None = None
-    least_ns = (stretch.end_ns - stretch.start_ns) // LOOKS_MAX
-    now_ns = stretch.start_ns
-    while True:
-        level, vertical, vehicle = _room(motion, fence, extent, now_ns)
-        room = min(level, vertical)
-        if room < allowed_m and (worst is None or -room > worst.outside_m):
-            worst = Breach(stretch.leg, vehicle, -room, (now_ns - motion.start_ns) * 1e-9)
-        if now_ns >= stretch.end_ns:
-            return worst
-        way_level, way_vertical = (max(x, -OUTSIDE_STEP * x, STEP_M) for x in (level, vertical))
-        step_s = min(way_level / level_m_s, way_vertical / vertical_m_s)
-        now_ns = min(now_ns + max(round(step_s * 1e9), least_ns, 1), stretch.end_ns)
+def examined(motion: Motion, fence: Fence) -> tuple[Breach | None, float]:
+    """`first_breach` of a motion with slots, and the looks that it took."""
+    march = _March(motion, fence)
+    room, _ = march.least_room(motion.start_ns)
+    march.allowed_m = min(room, 0.0) - TOLERANCE_M
+    spans = list(_spans(motion))
+    if march.allowed_m < -2.0 * TOLERANCE_M:
+        end = spans[-1]
+        room, vehicle = march.least_room(end.end_ns)
+        if isfinite(motion.leg_starts[-1][0]):
+            # A velocity that is kept must lead back too.
+            room, vehicle = min((room, vehicle), march.least_room(end.end_ns + 1_000_000_000))
+        if room >= march.allowed_m:
+            return None, march.looks
+        return Breach(end.leg, vehicle, -room, (end.end_ns - motion.start_ns) * 1e-9), march.looks
+    for span in spans:
+        if march.inside(span):
+            continue
+        if march.exhausted:
+            return Breach(span.leg, 0, 0.0, (span.start_ns - motion.start_ns) * 1e-9), march.looks
+        return march.deepest([s for s in spans if s.leg == span.leg]), march.looks
+    return None, march.looks
 
 
 def only_stops(motion: Motion, before: Motion) -> bool:
     """Whether a motion does nothing but bring the formation of the one before to rest: that is never refused."""
     rests = all(isinstance(leg, VelocityLeg) and leg.velocity_ned_m_s == ZERO for leg in motion.legs)
     return bool(motion.legs) and rests and motion.slots == before.slots
+
+
+def slots_apart_m(motion: Motion) -> float:
+    """The least distance of two slots from the motion's start to the end of its change of formation (m).
+
+    All pass from before to after by the same share at a time, so that two slots' offset moves on a straight line.
+    """
+    gone = motion.moment(motion.start_ns).blend[0]
+    now = [(_between(change, gone), change.after) for change in motion.slots.values()]
+    least2 = inf
+    for k, (a, a_after) in enumerate(now):
+        for b, b_after in now[:k]:
+            x, y, z = a.north - b.north, a.east - b.east, a.down - b.down
+            dx = a_after.north - b_after.north - x
+            dy = a_after.east - b_after.east - y
+            dz = a_after.down - b_after.down - z
+            way2 = dx * dx + dy * dy + dz * dz
+            share = min(max(-(x * dx + y * dy + z * dz) / way2, 0.0), 1.0) if way2 > 0.0 else 0.0
+            x, y, z = x + share * dx, y + share * dy, z + share * dz
+            least2 = min(least2, x * x + y * y + z * z)
+    return least2**0.5 if isfinite(least2) else inf
+
+
+def slots_continue(motion: Motion, before: Motion, tolerance_m: float) -> bool:
+    """Whether a motion's slots begin where those of the one before are then."""
+    gone, there = (m.moment(motion.start_ns).blend[0] for m in (motion, before))
+    return all(
+        dist(_between(change, gone), _between(before.slots[i], there)) <= tolerance_m
+        for i, change in motion.slots.items()
+    )
+
+
+def _between(change: SlotChange, share: float) -> Ned:
+    return Ned(*(a + share * (b - a) for a, b in zip(*change, strict=True)))

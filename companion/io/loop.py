@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from companion.agent import Agent, Outputs
+from companion.border import Border
 from companion.config import FleetConfig
 from companion.core.failsafe import CONFIGURATION_S, Failsafe
 from companion.core.values import Instant
@@ -45,6 +46,8 @@ STATUS_LASTS_NS = 50_000_000
 """a status this old is told again: making one takes a good part of a control period; a command makes it anew"""
 LANDING_GRACE_S = 3.0
 """how long an ending companion waits for its autopilot to confirm landing"""
+LOST = 4
+"""exit status of a companion whose control ticks do nothing but raise"""
 ABANDONED_GRACE_S = 1.0
 """the same when whoever launched it is gone"""
 
@@ -97,6 +100,7 @@ class Companion:
         self.settings = settings
         self.boot_id = secrets.randbits(32)
         self.agent = Agent(config, settings.vehicle_id, self.boot_id)
+        self.border = Border(self.agent)
         self.clock = FleetClock()
         self._wake_read, self._wake_write = socket.socketpair()
         self._wake_read.setblocking(False)
@@ -151,7 +155,7 @@ class Companion:
             self._noticed.add(failsafe)
             now = self._instant(now_ns)
             self._record("input/notice", now, failsafe.name.encode())
-            self.agent.notice(failsafe, now)
+            self.border.notice(failsafe, now)
 
     def close(self) -> None:
         """Release everything, the Zenoh session first."""
@@ -163,13 +167,16 @@ class Companion:
         stop_by_ns = now.monotonic_ns + round(grace_s * 1e9)
         if self._stop_by_ns is None:
             self._record("input/stop", now, b"")
-            self.agent.stop(now)
+            self.border.stop(now)
             self._stop_by_ns = stop_by_ns
             self._notifier.stopping()
         self._stop_by_ns = min(self._stop_by_ns, stop_by_ns)
 
     def run(self) -> int:
-        """Run until stopped; 0 if the vehicle was safe then, 3 if it still flew without a confirmed landing."""
+        """Run until stopped; 0 if the vehicle was safe then, 3 if it still flew without a confirmed landing.
+
+        4 at once if control ticks do nothing but raise (`border`): the autopilot's failsafe has the vehicle then.
+        """
         asked: list[bool] = []
         waiting: list[Any] = [self.link, self._wake_read]
         if self.settings.stop_fd is not None:
@@ -185,7 +192,7 @@ class Companion:
         with _signals(ask):
             self._notifier.ready()
             while True:
-                deadline_ns = min(self.agent.next_deadline_ns(), self._second_ns)
+                deadline_ns = min(self.border.next_deadline_ns(), self._second_ns)
                 ready, _, _ = select.select(waiting, [], [], max(deadline_ns - time.monotonic_ns(), 0) * 1e-9)
                 requests = self._receive(ready)
                 if asked:
@@ -199,6 +206,9 @@ class Companion:
                 for request in sorted(requests, key=lambda r: r.kind != "command"):
                     self._reply(request)
                 now_ns = time.monotonic_ns()
+                self._tell_raised(now_ns)
+                if self.border.lost(now_ns):
+                    return LOST
                 if now_ns >= self._second_ns:
                     self._each_second(now_ns)
                 if self._stop_by_ns is not None and (self.agent.stopped or now_ns >= self._stop_by_ns):
@@ -220,7 +230,7 @@ class Companion:
                     continue
                 now = self._instant(received_ns)
                 self._record("input/mavlink", now, datagram)
-                if self.agent.receive_mavlink(datagram, now):
+                if self.border.receive_mavlink(datagram, now):
                     self.link.confirm(address, received_ns)
                 if self._driver_ns is None and self.agent.next_deadline_ns() == 0:
                     self._driver_ns = received_ns
@@ -232,20 +242,20 @@ class Companion:
             match event:
                 case PeerMessage():
                     self._record("input/peer", now, event.key.encode() + b"\0" + event.payload)
-                    self.agent.receive_peer(event.key, event.payload, now)
+                    self.border.receive_peer(event.key, event.payload, now)
                 case PresenceChange():
                     self._record("input/presence", now, bytes((event.vehicle_id, event.alive)))
-                    self.agent.receive_presence(event.vehicle_id, event.alive, now)
+                    self.border.receive_presence(event.vehicle_id, event.alive, now)
                 case Request():
                     requests.append(event)
         return requests
 
     def _advance(self, deadline_ns: int) -> None:
-        if self.agent.next_deadline_ns() > time.monotonic_ns():
+        if self.border.next_deadline_ns() > time.monotonic_ns():
             return
         now = self._instant(time.monotonic_ns())
         self._record("advance", now, b"")
-        out = self.agent.advance(now)
+        out = self.border.advance(now)
         for datagram in out.mavlink:
             self.link.send(datagram)
         sent_ns = time.monotonic_ns()
@@ -253,6 +263,14 @@ class Companion:
             self.network.publish(topic, payload)
         self._notifier.turned(sent_ns)
         self._after(out, now, sent_ns, deadline_ns)
+
+    def _tell_raised(self, now_ns: int) -> None:
+        """Log and record what was raised for the first time."""
+        notes, self.border.notes = self.border.notes, []
+        for note in notes:
+            self._record("note", self._instant(now_ns), f"raised: {note}".encode())
+            with suppress(OSError):
+                self.settings.log(f"raised: {note}")
 
     def _after(self, out: Outputs, now: Instant, sent_ns: int, deadline_ns: int) -> None:
         for datagram in out.mavlink:
@@ -279,17 +297,22 @@ class Companion:
         now = self._instant(time.monotonic_ns())
         if request.kind == "command":
             self._record("input/command", now, request.payload)
-            answer = self.agent.receive_command(request.payload, now)
+            answer = self.border.receive_command(request.payload, now)
             self._record("output/answer", now, answer)
             self._status = None
             request.reply(answer)
             return
         if request.kind == "preflight":
-            request.reply(self._preflight(request, now))
-            return
-        if self._status is None or now.monotonic_ns - self._status_ns > STATUS_LASTS_NS:
-            self._status, self._status_ns = self._make_status(now), now.monotonic_ns
-        request.reply(self._status)
+            told = self.border.reply("preflight", lambda: self._preflight(request, now))
+        else:
+            if self._status is None or now.monotonic_ns - self._status_ns > STATUS_LASTS_NS:
+                self._status, self._status_ns = (
+                    self.border.reply("status", lambda: self._make_status(now)),
+                    now.monotonic_ns,
+                )
+            told = self._status
+        if told is not None:
+            request.reply(told)
 
     def _make_status(self, now: Instant) -> bytes:
         status = self.agent.status(now)
@@ -304,6 +327,7 @@ class Companion:
             "peer: malformed": counters.malformed,
         }
         status["rejected"] |= {kind: count for kind, count in elsewhere.items() if count}
+        status["rejected"] |= {f"raised: {kind}": count for kind, count in self.border.raised.items()}
         return json.dumps(status).encode()
 
     def _preflight(self, request: Request, now: Instant) -> bytes:

@@ -18,7 +18,20 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from companion.core.frames import Ned
-from companion.core.plan import GotoLeg, Leg, Motion, SlotChange, TurnLeg, VelocityLeg
+from companion.core.motion_check import (
+    DURATION_MAX_S,
+    HEADING_MAX_RAD,
+    LEGS_MAX,
+    MOTION_BYTES_MAX,
+    PLACE_MAX_M,
+    TURN_ANGLE_MAX_RAD,
+    TURN_ANGLE_MIN_RAD,
+    TURN_RATE_MAX_RAD_S,
+    TURN_RATE_MIN_RAD_S,
+    VEHICLES_MAX,
+    VELOCITY_MAX_M_S,
+)
+from companion.core.plan import BLEND_MIN_S, GOTO_MIN_S, GotoLeg, Leg, Motion, SlotChange, TurnLeg, VelocityLeg
 from companion.core.values import PeerMessage, PeerSample, Phase
 from companion.errors import WireError
 
@@ -92,13 +105,16 @@ def _sample(payload: bytes, at: int, vehicle_id: int, phase: int, revision: int)
     return PeerSample(vehicle_id, time_ns, Ned(*numbers[:3]), Ned(*numbers[3:]), revision, known)
 
 
-# Ranges that any plan keeps by far, and within which its arithmetic cannot overflow.
-_Metres = Annotated[float, Field(ge=-PLAUSIBLE_MAX, le=PLAUSIBLE_MAX, allow_inf_nan=False)]
-_MetresPerSecond = Annotated[float, Field(ge=-100, le=100, allow_inf_nan=False)]
+# The bounds on a motion's single values: `core.motion_check` has them for the file and for the wire, with what a whole
+# one must keep. Within them its arithmetic neither overflows nor divides by nothing.
+_Metres = Annotated[float, Field(ge=-PLACE_MAX_M, le=PLACE_MAX_M, allow_inf_nan=False)]
+_MetresPerSecond = Annotated[float, Field(ge=-VELOCITY_MAX_M_S, le=VELOCITY_MAX_M_S, allow_inf_nan=False)]
 _Place = tuple[_Metres, _Metres, _Metres]
 _Velocity = tuple[_MetresPerSecond, _MetresPerSecond, _MetresPerSecond]
-_Angle = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
-TURN_RATE_MIN_RAD_S = 1e-4
+_Heading = Annotated[float, Field(ge=-HEADING_MAX_RAD, le=HEADING_MAX_RAD, allow_inf_nan=False)]
+_Rate = Annotated[float, Field(ge=-TURN_RATE_MAX_RAD_S - 1e-9, le=TURN_RATE_MAX_RAD_S + 1e-9, allow_inf_nan=False)]
+_Duration = Annotated[float, Field(ge=0, le=DURATION_MAX_S, allow_inf_nan=False)]
+_Id = Annotated[int, Field(ge=1, le=VEHICLES_MAX)]
 
 
 class _Model(BaseModel):
@@ -108,20 +124,20 @@ class _Model(BaseModel):
 class _VelocityLeg(_Model):
     kind: Literal["velocity"]
     velocity_ned_m_s: _Velocity
-    duration_s: Annotated[float, Field(ge=0, le=1e7, allow_inf_nan=False)]
+    duration_s: _Duration
 
 
 class _TurnLeg(_Model):
     kind: Literal["turn"]
-    rate_rad_s: Annotated[float, Field(ge=-1.1, le=1.1, allow_inf_nan=False)]
-    angle_rad: Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)] | None
+    rate_rad_s: _Rate
+    angle_rad: Annotated[float, Field(ge=TURN_ANGLE_MIN_RAD, le=TURN_ANGLE_MAX_RAD, allow_inf_nan=False)] | None
     """None circles for ever (JSON knows no infinity)"""
 
 
 class _GotoLeg(_Model):
     kind: Literal["goto"]
     target_ned_m: _Place
-    duration_s: Annotated[float, Field(ge=0.1, le=1e7, allow_inf_nan=False)]
+    duration_s: Annotated[float, Field(ge=GOTO_MIN_S, le=DURATION_MAX_S, allow_inf_nan=False)]
 
 
 class _Motion(_Model):
@@ -130,17 +146,18 @@ class _Motion(_Model):
     start_ns: Annotated[int, Field(ge=0, lt=1 << 63)]
     issuer: Annotated[int, Field(ge=0, le=255)]
     shape: Annotated[str, Field(max_length=32)]
-    slots: dict[int, tuple[_Place, _Place]]
+    slots: Annotated[dict[_Id, tuple[_Place, _Place]], Field(min_length=1, max_length=VEHICLES_MAX)]
     blend_start_ns: Annotated[int, Field(ge=0, lt=1 << 63)]
-    blend_s: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)]
+    blend_s: _Duration
     legs_start_ns: Annotated[int, Field(ge=0, lt=1 << 63)]
     centre_ned_m: _Place
     velocity_ned_m_s: _Velocity
-    heading_rad: _Angle
-    heading_rate_rad_s: Annotated[float, Field(ge=-10, le=10, allow_inf_nan=False)]
+    heading_rad: _Heading
+    heading_rate_rad_s: _Rate
     heading_follows_turns: bool
     legs: Annotated[
-        tuple[Annotated[_VelocityLeg | _TurnLeg | _GotoLeg, Field(discriminator="kind")], ...], Field(max_length=100)
+        tuple[Annotated[_VelocityLeg | _TurnLeg | _GotoLeg, Field(discriminator="kind")], ...],
+        Field(max_length=LEGS_MAX),
     ]
     then: Literal["stay", "land", "return"]
 
@@ -162,12 +179,17 @@ def encode_motion(motion: Motion) -> bytes:
 
 
 def decode_motion(payload: bytes) -> Motion:
-    """A motion from JSON; WireError for anything that is not exactly one."""
+    """A motion from JSON; WireError for anything that is not exactly one, with single values within their bounds."""
+    if len(payload) > MOTION_BYTES_MAX:
+        raise WireError("motion", f"has {len(payload)} bytes, may have {MOTION_BYTES_MAX}")
     try:
         m = _Motion.model_validate_json(payload)
     except ValidationError as error:
-        first = error.errors()[0]
-        raise WireError("motion", f"{'.'.join(str(p) for p in first['loc'])}: {first['msg']}") from None
+        first = error.errors(include_url=False, include_context=False, include_input=False)[0]
+        place = ".".join(str(p) for p in first["loc"])
+        raise WireError("motion", f"{place[:80]}: {first['msg'][:160]}") from None
+    if 0.0 < m.blend_s < BLEND_MIN_S:
+        raise WireError("motion", f"blend_s: must be 0 s or at least {BLEND_MIN_S:g} s, got {m.blend_s:g}")
     legs: list[Leg] = []
     for leg in m.legs:
         match leg:
@@ -175,7 +197,7 @@ def decode_motion(payload: bytes) -> Motion:
                 legs.append(VelocityLeg(Ned(*leg.velocity_ned_m_s), leg.duration_s))
             case _TurnLeg():
                 if not abs(leg.rate_rad_s) >= TURN_RATE_MIN_RAD_S:
-                    raise WireError("motion", "a turn without a rate")
+                    raise WireError("motion", f"legs.{len(legs)}: a turn without a rate")
                 legs.append(TurnLeg(leg.rate_rad_s, float("inf") if leg.angle_rad is None else leg.angle_rad))
             case _GotoLeg():
                 legs.append(GotoLeg(Ned(*leg.target_ned_m), leg.duration_s))

@@ -2,14 +2,17 @@
 
 import itertools
 import json
+import os
 import random
 import struct
+import sys
 from collections.abc import Callable
 from math import inf, nan
 from typing import Any
 
 import pytest
 from flights import Tape, check_setpoint, fleet, launch, parse, until_formed
+from fuzz_inputs import Input, Inputs
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import development as dialect
@@ -18,7 +21,8 @@ from companion.agent import Agent
 from companion.core.counts import OTHER
 from companion.core.frames import Ned
 from companion.core.values import Instant, PeerMessage, PeerSample, Phase
-from companion.wire.peer import VERSION, encode_motion, encode_state
+from companion.errors import WireError
+from companion.wire.peer import VERSION, decode_motion, decode_state, encode_motion, encode_state
 from sim.lockstep import UTC_AT_START_NS, Lockstep
 
 pytestmark = pytest.mark.timeout(600)
@@ -353,3 +357,91 @@ def test_any_order_of_events_leaves_an_agent_that_goes_on(events: list[tuple[str
                 check_setpoint(datagram, CONFIG)
         json.dumps(agent.status(now))
     assert agent.next_deadline_ns() <= now_ns + 1_100_000_000
+
+
+# -- what decoders let through -----------------------------------------------------------------------------------------
+
+CALLS_MAX = 150_000
+"""calls of Python functions within the handling of one input: the same on every machine; some 15 ms of a fast core"""
+
+
+class Calls:
+    """Counts calls of Python functions while it is entered."""
+
+    def __enter__(self) -> "Calls":
+        self.count = 0
+        sys.setprofile(self._event)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        sys.setprofile(None)
+
+    def _event(self, frame: object, event: str, argument: object) -> None:
+        self.count += event == "call"
+
+
+def give(agent: Agent, given: Input, now: Instant) -> None:
+    """Hand an input to an agent as its process does, without the border that catches what raises."""
+    match given.kind:
+        case "plan" | "state":
+            agent.receive_peer(given.key, given.payload, now)
+        case "command":
+            assert json.loads(agent.receive_command(given.payload, now))["accepted"] in (True, False)
+        case "presence":
+            agent.receive_presence(given.payload[0], bool(given.payload[1]), now)
+        case "status":
+            assert len(json.dumps(agent.status(now))) < 40_000
+        case "preflight":
+            assert len(agent.account(now).model_dump_json()) < 40_000
+
+
+def flooded(seed: int, count: int) -> tuple[int, int, int]:
+    """A flight of five that gets inputs while it flies: how many each in all, of those let through by decoders, and the
+    most calls that one took."""
+    config = fleet(5, altitude_m=10.0, change=lambda tables: tables.update(fence={**FENCE}))
+    ls = launch(config, seed=seed)
+    until_formed(ls)
+    inputs, given, through, most = Inputs(config, seed), 0, 0, 0
+    while given < count and any(v.agent.flight.steers for v in ls.vehicles.values()):
+        ls.run_until((ls.now_ns + 20_000_000) * 1e-9)
+        for i, v in ls.vehicles.items():
+            for _ in range(8 if v.agent.flight.steers else 0):
+                one = inputs.one(v.agent.programme.newest, ls.now.fleet_ns)
+                if one.kind in ("plan", "state"):
+                    try:
+                        (decode_motion if one.kind == "plan" else decode_state)(one.payload)
+                    except WireError:
+                        continue
+                    one = one._replace(key=one.key.replace(f"fleet/{i}/", f"fleet/{i % 5 + 1}/"))
+                    through += 1
+                with Calls() as calls:
+                    give(v.agent, one, ls.now)
+                given, most = given + 1, max(most, calls.count)
+    for v in ls.vehicles.values():
+        rejected = v.agent.status(ls.now)["rejected"]
+        assert len(rejected) < 80, sorted(rejected)
+    return given, through, most
+
+
+FENCE = {"radius_m": 200.0, "floor_m": 2.0, "ceiling_m": 50.0}
+
+
+def test_nothing_that_the_decoders_let_through_makes_an_agent_in_flight_raise_or_costs_it_much() -> None:
+    given, through, most = flooded(seed=1, count=3000)
+    assert given > 1000
+    assert through > 0.5 * given
+    assert most < CALLS_MAX
+
+
+@pytest.mark.long
+@pytest.mark.timeout(7200)
+def test_two_hundred_thousand_inputs_that_the_decoders_let_through_are_withstood() -> None:
+    """STARLING_FUZZ_INPUTS sets another number, STARLING_FUZZ_SEED another beginning."""
+    wanted = int(os.environ.get("STARLING_FUZZ_INPUTS", "200000"))
+    seed = int(os.environ.get("STARLING_FUZZ_SEED", "1000"))
+    total = most = flights = 0
+    while total < wanted:
+        given, _, calls = flooded(seed + flights, min(wanted - total, 20_000))
+        total, most, flights = total + given, max(most, calls), flights + 1
+        sys.stdout.write(f"flight {flights}: {given} inputs, {total} in all, at most {most} calls each\n")
+    assert most < CALLS_MAX

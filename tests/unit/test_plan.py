@@ -256,7 +256,7 @@ def test_a_goto_leg_ends_at_its_target_at_rest(start: Ned, v0: Ned, target: Ned,
 @PROPERTY
 @given(places, places, st.floats(0.2, 5.0))
 def test_goto_durations_keep_speed_and_acceleration(start: Ned, target: Ned, speed: float) -> None:
-    whole = goto_duration_s(dist(start, target), speed)
+    whole = goto_duration_s(Ned(*(b - a for a, b in zip(start, target, strict=True))), ZERO, speed)
     m = motion(centre_ned_m=start, legs=(GotoLeg(target, whole),))
     centres = [m.moment(ns(whole * k / 200)).centre for k in range(201)]
     assert max(hypot(*c.velocity) for c in centres) <= speed * (1 + 1e-6)
@@ -266,7 +266,7 @@ def test_goto_durations_keep_speed_and_acceleration(start: Ned, target: Ned, spe
 @PROPERTY
 @given(st.floats(0.0, 200.0), st.floats(0.2, 5.0))
 def test_blend_durations_keep_speed_acceleration_and_their_minimum(way: float, speed: float) -> None:
-    whole = blend_duration_s(way, speed)
+    whole = blend_duration_s([SlotChange(ZERO, Ned(way, 0.0, 0.0))], speed)
     assert whole >= BLEND_MIN_S
     slopes = [minimum_jerk(k / 400) for k in range(401)]
     assert max(m1 for _, m1, _ in slopes) * way / whole <= speed * (1 + 1e-6)

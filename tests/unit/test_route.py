@@ -13,14 +13,19 @@ from companion.core.fence import Fence
 from companion.core.formation import shape_slots
 from companion.core.frames import Ned
 from companion.core.plan import GotoLeg, Leg, Motion, SlotChange, TurnLeg, VelocityLeg, with_formation, with_legs
-from companion.core.route import STEP_M, first_breach, only_stops
+from companion.core.route import RESOLUTION_M, first_breach, only_stops
 from companion.core.values import ZERO
 
+NEAR_M = 0.25
+"""to this the depth of a breach is told, amid a curve"""
 FENCE = Fence(2.0, 50.0, radius_m=50.0)
 NOTCHED = Fence(
     2.0, 50.0,
     corners_m=((-60.0, -60.0), (60.0, -60.0), (60.0, -6.0), (0.0, 0.0), (60.0, 6.0), (60.0, 60.0), (-60.0, 60.0)),
 )  # fmt: skip
+OCTAGON = Fence(
+    2.0, 50.0, corners_m=tuple((52.0 * math.cos(k * pi / 4), 52.0 * math.sin(k * pi / 4)) for k in range(8))
+)
 
 
 def motion(*legs: Leg, count: int = 5, shape: str = "v", velocity: Ned = ZERO, follow: bool = False) -> Motion:
@@ -83,7 +88,7 @@ def test_a_formation_that_turns_with_its_course_swings_its_arms_out() -> None:
     breach = first_breach(line, long_fence)
     assert breach is not None
     assert breach.leg == 0
-    assert breach.outside_m == pytest.approx(-sampled_worst(line, long_fence, 18.0), abs=STEP_M)
+    assert breach.outside_m == pytest.approx(-sampled_worst(line, long_fence, 18.0), abs=NEAR_M)
 
 
 @pytest.mark.parametrize(("speed", "inside"), [(3.0, True), (4.9, False)])
@@ -116,7 +121,7 @@ def test_a_way_across_a_notch_is_refused_though_both_its_ends_are_inside() -> No
     assert NOTCHED.room_m(there) > 7.0
     breach = first_breach(m, NOTCHED)
     assert breach is not None
-    assert breach.outside_m == pytest.approx(-sampled_worst(m, NOTCHED, 80.0), abs=STEP_M)
+    assert breach.outside_m == pytest.approx(-sampled_worst(m, NOTCHED, 80.0), abs=NEAR_M)
 
 
 def test_a_change_of_formation_near_the_edge_is_refused_before_any_leg() -> None:
@@ -129,7 +134,7 @@ def test_a_change_of_formation_near_the_edge_is_refused_before_any_leg() -> None
     assert breach is not None
     assert breach.leg is None
     assert "its formation takes vehicle" in breach.sentence()
-    assert breach.outside_m == pytest.approx(8.0, abs=STEP_M)
+    assert breach.outside_m == pytest.approx(8.0, abs=NEAR_M)
 
 
 def test_a_way_back_is_taken_though_the_formation_first_drifts_further_out() -> None:
@@ -185,7 +190,7 @@ legs = st.one_of(
 @settings(deadline=None, max_examples=60)
 @given(
     st.lists(legs, min_size=1, max_size=3),
-    st.sampled_from([FENCE, NOTCHED]),
+    st.sampled_from([FENCE, NOTCHED, OCTAGON]),
     st.booleans(),
     st.sampled_from(["v", "line"]),
 )
@@ -195,8 +200,32 @@ def test_the_march_finds_what_dense_sampling_finds(plan: list[Leg], fence: Fence
     assert end_ns is not None
     worst = sampled_worst(m, fence, end_ns * 1e-9)
     breach = first_breach(m, fence)
-    if worst < -STEP_M:
+    if worst < -RESOLUTION_M:
         assert breach is not None
     if breach is not None:
         assert math.isclose(breach.outside_m, -fence.room_m(m.reference(breach.vehicle_id, round(breach.time_s * 1e9)).position_ned_m), abs_tol=1e-5)  # fmt: skip  # noqa: E501
-        assert breach.outside_m <= -worst + STEP_M
+        assert breach.outside_m <= -worst + NEAR_M
+
+
+within = st.tuples(st.floats(-70.0, 70.0), st.floats(-70.0, 70.0))
+
+
+@given(within, within, st.sampled_from([FENCE, NOTCHED, OCTAGON, Fence(2.0, 50.0)]))
+def test_the_least_room_along_a_straight_way_is_what_dense_sampling_finds(
+    a: tuple[float, float], b: tuple[float, float], fence: Fence
+) -> None:
+    sampled = min(fence.edge_room_m(*(p + (q - p) * k / 400 for p, q in zip(a, b, strict=True))) for k in range(401))
+    least = fence.edge_room_along_m(*a, *b)
+    if sampled < 0.0:
+        assert least < 0.5
+    if least < -fence.margin_m:
+        assert sampled < 0.0
+    if min(sampled, least) >= 0.0:
+        assert least == pytest.approx(sampled, abs=0.5)
+        assert least <= sampled + 1e-9
+
+
+def test_only_a_notch_makes_a_fence_that_is_not_convex() -> None:
+    assert [f.convex for f in (FENCE, OCTAGON, NOTCHED, replace(OCTAGON, corners_m=OCTAGON.corners_m[::-1]))] == [
+        True, True, False, True,
+    ]  # fmt: skip

@@ -12,12 +12,21 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from companion.core.frames import Ned
-from companion.core.plan import GotoLeg, Leg, Motion, SlotChange, TurnLeg, VelocityLeg
+from companion.core.motion_check import (
+    DURATION_MAX_S,
+    MOTION_BYTES_MAX,
+    PLACE_MAX_M,
+    TURN_ANGLE_MAX_RAD,
+    TURN_ANGLE_MIN_RAD,
+    TURN_RATE_MAX_RAD_S,
+    TURN_RATE_MIN_RAD_S,
+    VELOCITY_MAX_M_S,
+)
+from companion.core.plan import BLEND_MIN_S, GOTO_MIN_S, GotoLeg, Leg, Motion, SlotChange, TurnLeg, VelocityLeg
 from companion.core.values import PeerMessage, PeerSample, Phase
 from companion.errors import WireError
 from companion.wire.peer import (
     PLAUSIBLE_MAX,
-    TURN_RATE_MIN_RAD_S,
     VERSION,
     decode_motion,
     decode_state,
@@ -37,24 +46,27 @@ messages = st.builds(
     st.booleans(),
 )  # fmt: skip
 
-metres = st.floats(-PLAUSIBLE_MAX, PLAUSIBLE_MAX)
+metres = st.floats(-PLACE_MAX_M, PLACE_MAX_M)
 places = st.builds(Ned, metres, metres, metres)
-speeds = st.floats(-100.0, 100.0)
+speeds = st.floats(-VELOCITY_MAX_M_S, VELOCITY_MAX_M_S)
 velocities = st.builds(Ned, speeds, speeds, speeds)
-rates = st.one_of(st.floats(TURN_RATE_MIN_RAD_S, 1.1), st.floats(-1.1, -TURN_RATE_MIN_RAD_S))
+turning = st.floats(-TURN_RATE_MAX_RAD_S, TURN_RATE_MAX_RAD_S)
+rates = turning.filter(lambda rate: abs(rate) >= TURN_RATE_MIN_RAD_S)
+seconds = st.floats(0.0, DURATION_MAX_S)
 legs: st.SearchStrategy[Leg] = st.one_of(
-    st.builds(VelocityLeg, velocities, st.floats(0.0, 1e7)),
-    st.builds(TurnLeg, rates, st.floats(1e-9, 1e6) | st.just(inf)),
-    st.builds(GotoLeg, places, st.floats(0.1, 1e7)),
+    st.builds(VelocityLeg, velocities, seconds),
+    st.builds(TurnLeg, rates, st.floats(TURN_ANGLE_MIN_RAD, TURN_ANGLE_MAX_RAD) | st.just(inf)),
+    st.builds(GotoLeg, places, st.floats(GOTO_MIN_S, DURATION_MAX_S)),
 )
 nanoseconds = st.integers(0, 2**63 - 1)
 motions = st.builds(
     Motion,
     revision=words, start_ns=nanoseconds, issuer=bytes_8, shape=st.text(max_size=32),
-    slots=st.dictionaries(st.integers(1, 250), st.builds(SlotChange, places, places), max_size=5),
-    blend_start_ns=nanoseconds, blend_s=st.floats(0.0, 3600.0), legs_start_ns=nanoseconds,
+    slots=st.dictionaries(st.integers(1, 250), st.builds(SlotChange, places, places), min_size=1, max_size=5),
+    blend_start_ns=nanoseconds, blend_s=st.just(0.0) | st.floats(BLEND_MIN_S, DURATION_MAX_S),
+    legs_start_ns=nanoseconds,
     centre_ned_m=places, velocity_ned_m_s=velocities, heading_rad=st.floats(-pi, pi),
-    heading_rate_rad_s=st.floats(-10.0, 10.0), heading_follows_turns=st.booleans(),
+    heading_rate_rad_s=turning, heading_follows_turns=st.booleans(),
     legs=st.lists(legs, max_size=4).map(tuple), then=st.sampled_from(("stay", "land")),
 )  # fmt: skip
 
@@ -275,7 +287,10 @@ def test_a_motions_number_that_is_none_is_refused(path: tuple[str | int, ...], v
     [
         (("version",), 1), (("colour",), 1), (("then",), "hover"), (("shape",), "x" * 33),
         (("slots", "1"), [[0, 0, 0]]), (("slots", "one"), [[0, 0, 0], [0, 0, 0]]),
-        (("legs", 0, "kind"), "loop"), (("legs", 1, "rate_rad_s"), 0.0),
+        (("legs", 0, "kind"), "loop"), (("legs", 1, "rate_rad_s"), 0.0), (("legs", 1, "rate_rad_s"), 1e-5),
+        (("legs", 1, "angle_rad"), 5e-324), (("legs", 2, "duration_s"), 0.5), (("blend_s",), 1e-200),
+        (("slots",), {}), (("slots", "0"), [[0, 0, 0], [0, 0, 0]]), (("heading_rate_rad_s",), 1.1),
+        (("legs", 0, "velocity_ned_m_s", 0), 12.1), (("centre_ned_m", 0), 1.1e5), (("legs", 0, "duration_s"), 86_401),
         (("legs",), [{"kind": "velocity", "velocity_ned_m_s": [0, 0, 0], "duration_s": 1}] * 101),
     ],
 )  # fmt: skip
@@ -288,3 +303,10 @@ def test_a_motion_of_another_make_is_refused(path: tuple[str | int, ...], value:
 def test_bytes_that_are_no_motion_are_refused(payload: bytes) -> None:
     with pytest.raises(WireError, match="motion"):
         decode_motion(payload)
+
+
+def test_a_motion_of_more_bytes_than_any_needs_is_refused_before_it_is_read() -> None:
+    payload = encode_motion(MOTION)
+    assert decode_motion(payload + b" " * (MOTION_BYTES_MAX - len(payload))) == MOTION
+    with pytest.raises(WireError, match="bytes, may have"):
+        decode_motion(payload + b" " * (MOTION_BYTES_MAX - len(payload) + 1))
