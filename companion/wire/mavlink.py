@@ -29,7 +29,7 @@ MULTICOPTERS = frozenset({2, 3, 4, 13, 14, 15, 29})
 """MAV_TYPE: quadrotor, coaxial, helicopter, hexarotor, octorotor, tricopter, dodecarotor"""
 PLAUSIBLE_MAX = 1e6
 """no position (m) or velocity (m/s) is larger than this: float32 holds far more, and squares of it overflow later"""
-REJECTED = ("malformed", "foreign system", "not finite", "out of range")
+REJECTED = ("malformed", "foreign system", "not finite", "out of range", "heartbeat of no autopilot")
 """what a link counts"""
 SETPOINT_TYPE_MASK = 0x903
 """ignore x, y, az and yaw rate: velocity and acceleration on the level, altitude by position, climb rate, yaw"""

@@ -482,12 +482,12 @@ def test_commanded_motions_are_examined_within_a_budget_of_their_own() -> None:
     random_ = random.Random(6)
     for k in range(200):
         motion = encode_motion(hard(random_, 40))
-        order = b'{"verb":"motion","revision":%d,"issuer":"x","motion":%s}' % (k + 1, motion)
+        order = b'{"verb":"motion","id":"%d","issuer":"x","after":{"1":[[1,0,0]]},"motion":%s}' % (k, motion)
         reasons.add(json.loads(agent.receive_command(order, NOW))["reason"])
     assert "too many motions at once: command it again" in reasons
     later = Instant(NOW.monotonic_ns + 60 * 10**9, NOW.fleet_ns)
     good = encode_motion(CONFIG.motion_into("v", FIRST, NOW.fleet_ns + 3 * 10**9, 0))
-    order = b'{"verb":"motion","revision":1,"issuer":"y","motion":%s}' % good
+    order = b'{"verb":"motion","id":"a","issuer":"y","after":{"1":[[1,0,0]]},"motion":%s}' % good
     assert json.loads(agent.receive_command(order, later))["accepted"] is True
 
 
