@@ -383,7 +383,7 @@ class Lockstep:
 
     def truth(self) -> np.ndarray:
         """Every vehicle's true state at 50 Hz, as TRUTH_DTYPE records."""
-        return np.frombuffer(b"".join(self._truth), TRUTH_DTYPE)
+        return np.frombuffer(bytearray().join(self._truth), TRUTH_DTYPE)
 
     def _sample_truth(self) -> None:
         fleet_ns = self.now.fleet_ns

@@ -153,7 +153,7 @@ FAILSAFES: dict[Failsafe, Row] = {
     ),
     Failsafe.DEAF: Row(
         "12 heartbeats due from two or more peers that are said to be there, none heard: 1.4 `trigger.t_max_s` with "
-        "ten vehicles, 2.1 with six or fewer", None, Action.HOLD,
+        "ten vehicles; with few, `peers.isolated_flight_s` after 2.1", None, Action.HOLD,
         "the link is gone, not the peers: each is taken to fly on until it must have noticed too, then to stand",
         "a peer is heard: it comes back to its slot",
     ),

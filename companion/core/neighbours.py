@@ -74,6 +74,8 @@ STRAIGHT_M = 0.05
 GATE_VELOCITY_M_S = 0.7
 GATE_RESIDUAL_M = 2.0
 GATE_PERIOD_NS = 100_000_000
+UNSTEERED_M = 0.5
+"""how much further than another one may be that its pilot or its autopilot moves: nobody tells where it turns next"""
 UNCERTAINTY_GROWTH_M_S = 0.3
 UNCERTAINTY_GROWTH_MAX_M = 1.0
 JUMPS = Failsafe.PEER_LIES.value
@@ -490,10 +492,14 @@ class PeerTable:
                 track.due_flown_ns = stood_ns
 
     def _deaf_after_ns(self, count: int) -> int:
-        """After how long without any state from `count` peers that are said to be there none can come any more."""
+        """After how long without any state from `count` peers that are said to be there none can come any more.
+
+        Of few peers that would last longer than it takes a vehicle alone to stand.
+        """
         limits = self.limits
         heartbeats = max(1.0, MISSING_HEARTBEATS / max(count, 1))
-        return round(min(limits.stale_after_s, heartbeats * limits.heartbeat_s + HEARTBEAT_MARGIN_S) * 1e9)
+        alone_s = limits.stale_after_s + limits.isolated_flight_s
+        return round(min(alone_s, heartbeats * limits.heartbeat_s + HEARTBEAT_MARGIN_S) * 1e9)
 
     def deaf(self, now: Instant) -> bool:
         """Whether no state comes any more from several peers that are all said to be there."""
@@ -605,6 +611,7 @@ class PeerTable:
         self, peer: _Peer, track: _Track, ego_ned_m: Ned, now: Instant, reference: Reference, own: Ned
     ) -> Neighbour:
         limits, sample = self.limits, track.sample
+        follows = sample.phase in FORMATION_PHASES
         tau_s = max(0.0, (now.fleet_ns - sample.time_ns) * 1e-9)
         if now.fleet_ns > track.due_ns and track.lost_at_ns is None and aloft(sample):
             track.fall_silent()
@@ -619,8 +626,10 @@ class PeerTable:
             position, velocity = held(sample, track.reference_then, reference, now.fleet_ns, limits)
             if peer.due_soon:
                 uncertainty = near_bound_m(tau_s, uncertainty, limits.motion)
+            if not follows and aloft(sample) and sample.phase not in FLYING_PHASES:
+                uncertainty += UNSTEERED_M
         sound = (
-            sample.phase in FORMATION_PHASES
+            follows
             and lost_at_ns is None
             and len(peer.tracks) == 1
             and now.fleet_ns >= peer.suspect_until_ns

@@ -250,7 +250,6 @@ def refused(noise: Noise, ls: Lockstep, i: int) -> None:
     agent.receive_peer(key, state(other, time_ns=now.fleet_ns + 2_000_000_000), now)
     agent.receive_peer(key, state(77), now)
     agent.receive_peer("fleet/77/state", state(77), now)
-    agent.receive_peer(f"fleet/{i}/state", state(i), now)
     agent.receive_peer("fleet/1/other", state(other), now)
     newest: Any = json.loads(encode_motion(agent.programme.newest))
     for wrong in (
@@ -292,8 +291,8 @@ def test_what_is_refused_is_counted_and_changes_not_one_bit_of_what_is_sent() ->
     for kind in (
         "malformed", "not finite", "out of range", "foreign system", "state: length", "state: version",
         "state: not finite", "state: out of range", "from the future", "state: id is not the key's", "foreign id",
-        "own id", "peer: unknown topic", "plan: motion", "command: malformed", "command: motion",
-        "command: unknown verb", "command: id", "plan: not this fleet's vehicles",
+        "peer: unknown topic", "plan: motion", "command: malformed", "command: motion",
+        "command: unknown verb", "command: id", "plan: its vehicles are not this fleet's",
     ):  # fmt: skip
         assert counted[kind] > 50, (kind, counted)
     assert OTHER not in counted

@@ -452,12 +452,12 @@ def deaf() -> tuple[float, float]:
     s = scene(4, change=brief)
     s.begin()
     s.ls.drop_topic("state")
-    until(s.ls, 6.0, lambda: all(p in (Phase.APART, Phase.LANDING) for p in s.ls.phases().values()))
+    until(s.ls, 9.0, lambda: all(p in (Phase.APART, Phase.LANDING) for p in s.ls.phases().values()))
     noticed = s.noted(Failsafe.DEAF)
     s.ls.restore_topics()
     until(s.ls, 20.0, lambda: s.ls.all_in(Phase.WAITING))
     assert distances(truth(s.ls, s.began_s)).min() > 3.0
-    return noticed, 4.2
+    return noticed, 4.2 + 3.0
 
 
 def battery_low() -> tuple[float, float]:
