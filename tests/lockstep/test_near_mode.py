@@ -182,6 +182,7 @@ def test_a_period_that_control_does_not_divide_is_kept_on_average() -> None:
         tables["trigger"].update(kind="periodic", period_s=0.05)  # type: ignore[attr-defined]
 
     ls = launch(fleet(2, change=change))
-    before = counted(ls)["triggered"]
+    before = sum(counted(ls).values())
     wait(ls, 10.0)
-    assert (counted(ls)["triggered"] - before) / 2 == pytest.approx(200, abs=6)
+    # An announcement stands for the period's own message, or comes beside it.
+    assert (sum(counted(ls).values()) - before) / 2 == pytest.approx(200, abs=12)
