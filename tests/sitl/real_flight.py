@@ -44,8 +44,9 @@ class RealFlight:
         self._socket.close()
 
     def boot(self) -> None:
-        """Until it may be armed."""
+        """Until it may be armed; in OFFBOARD without any setpoint since boot newer PX4's simulation stands still."""
         self.run_while(lambda: self.status != STANDBY, 60.0)
+        self.stream(self.setpoint(), 1.0)
         self.stream_at(mavlink.MAVLINK_MSG_ID_CURRENT_MODE, 20.0)
         self.run_while(lambda: self.arm() != 0, 60.0)
         assert self.disarm() == 0
