@@ -21,6 +21,7 @@ from companion.io.link import SERIAL_UNSENT_MOST, SerialLink
 from companion.wire.mavlink import FrameSplitter
 from sim.autopilot import Autopilot
 from sim.dynamics import GustParameters, NoiseParameters
+from sim.px4.parameters import defaults
 from sim.stub_fleet import FLEET_PARAMETERS
 
 pytestmark = pytest.mark.process
@@ -171,7 +172,7 @@ def test_a_vehicle_flies_over_a_serial_line(tmp_path: Path) -> None:
             system_id=1, boot_ns=now_ns, utc_offset_ns=time.time_ns() - now_ns, fleet_origin=fleet.config.origin,
             home_ned_m=Ned(0.0, 0.0, 0.0), gust=GustParameters(sigma_m_s2=0.0),
             noise=NoiseParameters(position_sigma_m=0.0, velocity_sigma_m_s=0.0),
-            parameters=dict(FLEET_PARAMETERS + QUICK),
+            parameters={k: v for k, v in FLEET_PARAMETERS + QUICK if k in defaults("1.16")},
         )  # fmt: skip
         over = threading.Event()
         thread = threading.Thread(target=serve, args=(autopilot, ours, over))
