@@ -143,8 +143,6 @@ class Operator:
             self._note_places(i, readable)
             self.doubled.pop(i, None)
         runs = [f"one up for {s['up_s']:.0f} s" for s in readable] + ["one that cannot be read"] * len(faults)
-        if len(answers) == 1 and any(s.get("own_id_heard") for s in readable):
-            runs.append("one that it hears")
         if len(runs) > 1:
             self.doubled[i] = " and ".join(runs)
         if not readable:
