@@ -389,6 +389,31 @@ def test_what_misses_least(
     north, east, peers_missed, others_missed = solved(u, scaled, peers)
     assert (north, east) == pytest.approx(expected[:2], abs=5e-4)
     assert (peers_missed / scale, others_missed / scale) == pytest.approx(expected[2:], abs=5e-4)
+    lengthened = [(g, h, scale * b) for g, h, b in rows]
+    answer = solved((scale * u[0], scale * u[1]), lengthened, peers, scale * MOST)
+    assert [x / scale for x in answer] == pytest.approx(expected, abs=5e-4)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("seed", range(30))
+def test_edges_that_meet_in_a_point_or_a_line_are_met_and_nothing_gives_way(seed: int, scale: float) -> None:
+    """Rounding of these numbers, whatever their unit, closes no set that is a point or a line."""
+    rng = random.Random(seed)
+    corner, (u_north, u_east) = wanted(rng), wanted(rng)
+    most, u = scale * MOST, (scale * u_north, scale * u_east)
+    through = []
+    for _ in range(6):
+        a, size = rng.uniform(-pi, pi), rng.uniform(0.1, 3.0)
+        g, h = size * cos(a), size * sin(a)
+        through.append((g, h, scale * (g * corner[0] + h * corner[1])))
+    north, east, *missed = solved(u, through, most=most)
+    assert missed == [0.0, 0.0]
+    assert excess((north, east), through, most) <= 1e-9 * scale
+    g, h, b = through[0]
+    back = [(-k * g, -k * h, -k * b) for k in (0.3, 1.7)]
+    north, east, *missed = solved(u, [through[0], *back], most=most)
+    assert missed == [0.0, 0.0]
+    assert (g * north + h * east) / scale == pytest.approx(b / scale, abs=1e-9)
 
 
 def test_rows_that_cannot_be_met_are_lowered_by_their_class_and_met_then() -> None:
