@@ -25,13 +25,13 @@ import typer
 
 ROOT = Path(__file__).resolve().parents[2]
 EXPLAINED = Path(__file__).with_name("survivors.toml")
-FILTER_TESTS = ("tests/unit/test_program.py", "tests/unit/test_safety.py", "tests/unit/test_fence.py")
+_PROGRAM, _SAFETY, _FENCE = (f"tests/unit/test_{x}.py" for x in ("program", "safety", "fence"))
 SOURCES = {
-    "companion/core/safety.py": FILTER_TESTS,
-    "companion/core/program.py": FILTER_TESTS,
+    "companion/core/safety.py": (_SAFETY, _FENCE, _PROGRAM),
+    "companion/core/program.py": (_PROGRAM, _SAFETY, _FENCE),
     "companion/core/phase.py": ("tests/unit/test_phase.py",),
 }
-"""what is changed, and the tests of which one must fail then"""
+"""what is changed, and the tests of which one must fail then, the likeliest first"""
 TESTS = tuple(dict.fromkeys(test for tests in SOURCES.values() for test in tests))
 FLIGHTS = (
     "test_safety.py::test_two_sent_head_on", "test_safety.py::test_the_same_two_collide",

@@ -154,6 +154,10 @@ def test_a_half_plane_is_of_the_distances_acceleration_and_two_that_touch_do_not
     assert plane.b == pytest.approx(6.25 * (1.0 - r * r) / (2.0 * max(r, 0.5)))
 
 
+def test_a_half_plane_of_a_wall_is_nobodys_and_stands() -> None:
+    assert HalfPlane(1.0, 0.0, 2.0) == (1.0, 0.0, 2.0, 0, 0.0, 0.0)
+
+
 def test_a_half_plane_tells_the_obstacles_velocity() -> None:
     drifting = peer(Ned(3.0, -1.0, 0.0), Ned(0.0, 0.4, 0.3), other_end_ned_m=Ned(3.0, 1.0, 0.0))
     assert half_plane(state(), ZERO, drifting)[4:] == pytest.approx((0.0, 0.2))
