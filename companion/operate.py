@@ -41,6 +41,9 @@ REVISIONS = 1 << 32
 STATUS_TIMEOUT_S = 1.0
 KILL_STATUS_TIMEOUT_S = 0.6
 RETRY_S = 0.5
+LOOK_AGAIN_S = 0.5
+"""a vehicle that hears its own id from elsewhere and answers alone is asked again after so long, as often as that fits
+into the time for an answer: a liar delays a kill by no more"""
 REASON_LENGTH_MAX = 500
 UP_TOGETHER_S = 30.0
 """companions that began within this are told as one start"""
@@ -62,6 +65,9 @@ class Link(Protocol):
         self, vehicle_ids: Iterable[int], kind: str, payload: bytes, timeout_s: float, retry_s: float
     ) -> dict[int, tuple[bytes, int, int] | None]:
         """Each one's first answer, with when it was asked and when it answered (UTC, ns)."""
+
+    def wait(self, seconds: float) -> None:
+        """Let time pass, in which the link may find more companions."""
 
 
 class PreflightError(RefusedError):
@@ -123,7 +129,14 @@ class Operator:
 
     def status(self, timeout_s: float = STATUS_TIMEOUT_S) -> dict[int, dict[str, Any] | None]:
         """Each vehicle's own account of itself; None from the silent, and from the unreadable, who are named there."""
-        answers = self.link.ask(self.ids, "status", b"", timeout_s, RETRY_S)
+        answers = dict(self.link.ask(self.ids, "status", b"", timeout_s, RETRY_S))
+        for _ in range(round(timeout_s / LOOK_AGAIN_S)):
+            # That somebody spoke under an id is no second companion, but may be one that the link has not found yet.
+            single = [i for i, told in answers.items() if len(told) == 1 and _hears_own_id(told[0], i)]
+            if not single:
+                break
+            self.link.wait(LOOK_AGAIN_S)
+            answers |= self.link.ask(single, "status", b"", timeout_s, RETRY_S)
         return {i: self._status(i, answers.get(i, ())) for i in self.ids}
 
     def _status(self, i: int, answers: tuple[bytes, ...]) -> dict[str, Any] | None:
@@ -368,6 +381,11 @@ class Operator:
         if fault is not None and not only_stops(motion, newest):
             raise RefusedError(fault.sentence)
         return replace(self.command("motion", motion=json.loads(encode_motion(motion))), notes=self._left_out())
+
+
+def _hears_own_id(answer: bytes, vehicle_id: int) -> bool:
+    said = read_status(answer, vehicle_id)
+    return not isinstance(said, str) and bool(said.get("own_id_heard"))
 
 
 def _followable(told: Mapping[str, Any], now_ns: int) -> Motion | str:

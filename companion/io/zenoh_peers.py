@@ -604,6 +604,10 @@ class OperatorLink:
         answers = self._ask(vehicle_ids, kind, payload, timeout_s, retry_s)
         return {i: found[0] if found else None for i, found in answers.items()}
 
+    def wait(self, seconds: float) -> None:
+        """Let time pass, in which the session may find more companions."""
+        time.sleep(seconds)
+
     def _ask(
         self, vehicle_ids: Iterable[int], kind: str, payload: bytes, timeout_s: float, retry_s: float
     ) -> dict[int, list[tuple[bytes, int, int]]]:

@@ -210,3 +210,6 @@ class InLockstep:
                 i: json.dumps(v.agent.status(self.ls.now)).encode() for i, v in self.ls.vehicles.items() if v.alive
             }
         return {i: (answers[i],) if i in answers else () for i in vehicle_ids}
+
+    def wait(self, seconds: float) -> None:
+        self.ls.run_until(self.ls.now_ns * 1e-9 + seconds)

@@ -65,6 +65,9 @@ class Fleet:
     """vehicle id -> the rows of its own preflight"""
     ahead_s: dict[int, float] = field(default_factory=dict)
     """vehicle id -> its clock against the operator's"""
+    waited_s: float = 0.0
+    found_late: tuple[int, ...] = ()
+    """vehicles whose second companion the link finds while it waits"""
 
     def ask(
         self, vehicle_ids: Iterable[int], kind: str, payload: bytes, timeout_s: float, retry_s: float
@@ -85,6 +88,11 @@ class Fleet:
             else:
                 answers[i] = (json.dumps(self.answer(i, payload)).encode(),)
         return answers
+
+    def wait(self, seconds: float) -> None:
+        self.waited_s += seconds
+        for i in self.found_late:
+            twice(self, i)
 
     def answer(self, i: int, payload: bytes) -> dict[str, object]:
         here = self.places.get(i, [100 + i, 1, 4])
@@ -359,6 +367,18 @@ def test_one_forged_put_under_a_vehicles_id_keeps_no_command_from_the_fleet() ->
     link = fleet()
     link.told[3] = {"own_id_heard": True}
     assert Operator(CONFIG, link).land().all_accepted
+    assert link.waited_s == pytest.approx(1.0)
+    assert Operator(CONFIG, link).kill().all_accepted
+    assert link.waited_s == pytest.approx(1.5)
+
+
+def test_a_second_companion_that_is_found_late_is_one_of_two() -> None:
+    link = fleet()
+    link.told[3] = {"own_id_heard": True}
+    link.found_late = (3,)
+    with pytest.raises(RefusedError, match="vehicle 3 is two companions"):
+        Operator(CONFIG, link).land()
+    assert link.commands() == []
 
 
 def test_what_ends_a_flight_reaches_both_if_that_is_wanted() -> None:
