@@ -250,10 +250,16 @@ class Lockstep:
             self._look_at_bounds(v.agent)
 
     def _look_at_bounds(self, agent: Agent) -> None:
+        """Of a peer that may be at several places, one must hold it: the one that comes nearest to its own bound."""
+        seen: dict[int, tuple[float, float, float]] = {}
         for n in agent.neighbours:
             if n.other_end_ned_m is None and agent.peers.due_soon(n.vehicle_id):
                 true = self.vehicles[n.vehicle_id].autopilot.truth().position_ned_m
-                self.near_bound.see(dist(n.position_ned_m, true), n.uncertainty_m)
+                error_m = dist(n.position_ned_m, true)
+                place = (error_m / n.uncertainty_m, error_m, n.uncertainty_m)
+                seen[n.vehicle_id] = min(seen.get(n.vehicle_id, place), place)
+        for _, error_m, bound_m in seen.values():
+            self.near_bound.see(error_m, bound_m)
 
     def _send(self, i: int, out: Outputs, sender: Agent) -> None:
         """What a companion sends goes on its ways, to its autopilot and to all who hear."""
