@@ -65,8 +65,8 @@ def check(
     usage or configuration.
     """
     from companion.io.check import hardware_checks
-    from companion.preflight import as_json as row_json
-    from companion.preflight import unmet
+    from companion.vehicle.preflight import as_json as row_json
+    from companion.vehicle.preflight import unmet
 
     config = load(fleet)
     rows = []
@@ -74,13 +74,13 @@ def check(
         rows.append(row)
         if not as_json:
             value = "-" if row.value is None else row.value
-            typer.echo(f"{'ok' if row.met else 'FAULT':5}  {row.name:20}  {value!s:>20}  {row.limit}")
+            typer.echo(f"{'ok' if row.passed else 'FAULT':5}  {row.name:20}  {value!s:>20}  {row.limit}")
     faults = unmet(rows)
     if as_json:
         typer.echo(json.dumps({"fit": not faults, "checks": [row_json(r) for r in rows]}))
     else:
         for fault in faults:
-            typer.echo(fault.says)
+            typer.echo(fault.message)
     raise typer.Exit(DIFFERENT if faults else 0)
 
 
@@ -92,7 +92,7 @@ def replay(
 
     Exit status: 0 the same, 1 different, or entries are missing (the first is shown), 2 no recording, or a damaged one.
     """
-    from companion.replay import replay_file
+    from companion.io.replay import replay_file
 
     began_s = process_time()
     result = replay_file(file)

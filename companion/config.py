@@ -20,13 +20,30 @@ import annotated_types
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
 
-from companion.core.fence import Fence
 from companion.core.formation import SHAPES, Slots, centred, minimum_distance, rotated, shape_slots
 from companion.core.frames import Geodetic, Ned
-from companion.core.hold import HoldKind
-from companion.core.law import Gains, paper_gains
+from companion.core.law.starling import Gains, paper_gains
 from companion.core.monitor import PeerMotion
-from companion.core.motion_check import (
+from companion.core.neighbours import PeerLimits
+from companion.core.prediction import HoldKind
+from companion.core.safety.fence import Fence
+from companion.core.safety.filter import DOWNWASH_RATIO, SafetyLimits, safety_radius_m
+from companion.core.trajectory import (
+    PADS,
+    FleetTrajectory,
+    Leg,
+    SlotChange,
+    Then,
+    TurnLeg,
+    VelocityLeg,
+    goto_leg,
+    leg_end,
+    top_speed_m_s,
+    with_formation,
+    with_legs,
+    with_return,
+)
+from companion.core.trajectory_check import (
     ALTITUDE_MIN_M,
     DURATION_MAX_S,
     LEGS_MAX,
@@ -41,23 +58,6 @@ from companion.core.motion_check import (
     MotionLimits,
     examine,
 )
-from companion.core.neighbours import PeerLimits
-from companion.core.plan import (
-    PADS,
-    Leg,
-    Motion,
-    SlotChange,
-    Then,
-    TurnLeg,
-    VelocityLeg,
-    goto_leg,
-    leg_end,
-    top_speed_m_s,
-    with_formation,
-    with_legs,
-    with_return,
-)
-from companion.core.safety import DOWNWASH_RATIO, SafetyLimits, safety_radius_m
 from companion.core.trigger import (
     ErrorTrigger,
     PeriodicTrigger,
@@ -521,7 +521,7 @@ class FleetConfig(_Table):
         apart_m = self.safety_radius_m / sqrt(2.0) if x.barrier else 0.0
         return MotionLimits(x.speed_max_m_s, x.climb_max_m_s, x.descent_max_m_s, apart_m, self.geofence)
 
-    def motion_into(self, shape: str, motion: Motion, at_ns: int, issuer: int) -> Motion:
+    def motion_into(self, shape: str, motion: FleetTrajectory, at_ns: int, issuer: int) -> FleetTrajectory:
         """The motion that takes over from `motion` with another formation.
 
         The slots use what speed the centre leaves them, half of the limit at most.
@@ -534,7 +534,7 @@ class FleetConfig(_Table):
             climb_m_s=x.climb_max_m_s / 4, descent_m_s=x.descent_max_m_s / 4,
         )  # fmt: skip
 
-    def motion_home(self, motion: Motion, at_ns: int, issuer: int) -> Motion:
+    def motion_home(self, motion: FleetTrajectory, at_ns: int, issuer: int) -> FleetTrajectory:
         """The motion that takes over from `motion` and brings every vehicle back over its own pad, to land."""
         share = PLAN_SPEED_SHARE / 2
         return with_return(
@@ -624,13 +624,13 @@ class FleetConfig(_Table):
         return {v.id: v.slot for v in self.vehicles if v.slot != "auto"}
 
     @cached_property
-    def first_motion(self) -> Motion:
+    def first_motion(self) -> FleetTrajectory:
         """Where everybody starts: each over its own pad at the formation's altitude, at rest."""
         heading = radians(self.formation.heading_deg)
         pads = [Ned(v.pad_north_m, v.pad_east_m, 0.0) for v in self.vehicles]
         centre = [sum(p[k] for p in pads) / len(pads) for k in range(2)]
         level = rotated(centred(pads), -heading)
-        return Motion(
+        return FleetTrajectory(
             revision=0,
             start_ns=0,
             issuer=0,
@@ -903,7 +903,7 @@ def _motion_faults(config: FleetConfig) -> Iterator[str]:
         return
     planned, start_ns = formed, formed.blend_end_ns
     if config.plan.legs:
-        now = formed.moment(start_ns).centre
+        now = formed.state_at(start_ns).centre
         legs = config.plan_legs(now.position, now.velocity)
         planned = with_legs(formed, at_ns=start_ns, issuer=0, legs=legs, then=config.plan.then)
         fault = examine(planned, limits, formed).fault

@@ -132,12 +132,12 @@ def up(
 
     Ctrl-C lands the fleet. Exit status: 0 the flight met its criteria, 1 it did not, 2 wrong usage or configuration.
     """
-    from sim.faults import load_scenario
-    from sim.launch import FlightOptions, flight_folder, fly
-    from sim.lock import only_flight, refuse_companions
-    from sim.sitl import check_build, parse_parameters
-    from sim.stub_fleet import check_stub_links
-    from sim.view import FlightView, show_summary
+    from sim.autopilot.stub_fleet import check_stub_links
+    from sim.launch.faults import load_scenario
+    from sim.launch.launch import FlightOptions, flight_folder, fly
+    from sim.launch.lock import only_flight, refuse_companions
+    from sim.launch.sitl import check_build, parse_parameters
+    from sim.launch.view import FlightView, show_summary
 
     if autopilot not in ("stub", "px4", "external"):
         raise ConfigError(f"--autopilot must be stub, px4 or external, got {autopilot!r}")
@@ -206,8 +206,8 @@ def stub(
     A vehicle's own `mavlink` URL moves both: the stub sends to that port, from 40 above it (1000 from the eleventh on).
     """
     from companion.config import parse
-    from sim.stub_fleet import check_stub_links, stub_settings
-    from sim.stubs import run_stubs
+    from sim.autopilot.stub_fleet import check_stub_links, stub_settings
+    from sim.autopilot.stubs import run_stubs
 
     config = parse(_tables(fleet, vehicles), fleet.name)
     check_stub_links(config)
@@ -235,8 +235,8 @@ def fault(
 ) -> None:
     """Have a stub autopilot of a running fleet suffer a fault; exit status 1 if it does not answer."""
     from companion.config import parse
-    from sim.faults import order_fault
-    from sim.px4.faults import Fault, FaultKind
+    from sim.autopilot.faults import Fault, FaultKind
+    from sim.launch.faults import order_fault
 
     if kind not in FAULTS:
         raise ConfigError(f"fault must be one of {', '.join(FAULTS)}, got {kind!r}")
@@ -255,7 +255,7 @@ def sitl(
 ) -> None:
     """Run PX4 SITL instances until standard input closes: for launchers."""
     from companion.config import parse
-    from sim.sitl import SitlHost, SitlSettings, check_build, parse_parameters
+    from sim.launch.sitl import SitlHost, SitlSettings, check_build, parse_parameters
 
     config = parse(_tables(fleet), fleet.name)
     parameters = parse_parameters(parameter or ())
@@ -266,7 +266,7 @@ def sitl(
 @app.command(hidden=True)
 def reference_loop(out: Annotated[Path, typer.Option()]) -> None:
     """An empty 50 Hz loop, to measure the machine beside a flight; ends when standard input closes."""
-    from sim.reference_loop import run_reference_loop
+    from sim.launch.reference_loop import run_reference_loop
 
     run_reference_loop(out, sys.stdin.fileno())
 
@@ -303,7 +303,7 @@ def _operate(fleet: Path, vehicles: int | None, verb: str, act: Callable[[Any], 
     from companion.config import parse
     from companion.io.loop import network_settings
     from companion.io.zenoh_peers import OperatorLink
-    from companion.operate import Operator
+    from companion.operator.client import Operator
 
     config = parse(_tables(fleet, vehicles), fleet.name)
     with OperatorLink(network_settings(config, None)) as link:
@@ -324,8 +324,8 @@ def status(
     from companion.config import parse
     from companion.io.loop import network_settings
     from companion.io.zenoh_peers import OperatorLink
-    from companion.operate import Operator
-    from sim.view import show_status
+    from companion.operator.client import Operator
+    from sim.launch.view import show_status
 
     config = parse(_tables(fleet, vehicles), fleet.name)
     with OperatorLink(network_settings(config, None)) as link:
@@ -356,8 +356,8 @@ def preflight(
     from companion.config import parse
     from companion.io.loop import network_settings
     from companion.io.zenoh_peers import OperatorLink
-    from companion.operate import Operator
-    from sim.view import show_preflight
+    from companion.operator.client import Operator
+    from sim.launch.view import show_preflight
 
     config = parse(_tables(fleet, vehicles), fleet.name)
     with OperatorLink(network_settings(config, None)) as link:
@@ -454,7 +454,7 @@ def move(
     vehicles: Vehicles = None,
 ) -> None:
     """Change the formation's motion: one of --velocity, --turn, --goto."""
-    from companion.operate import turn_leg, velocity_leg
+    from companion.operator.client import turn_leg, velocity_leg
 
     if sum(x is not None for x in (velocity, turn, goto)) != 1:
         raise ConfigError("fleet move needs exactly one of --velocity, --turn, --goto")

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from enum import Enum, unique
 
 from companion.core.failsafe import Failsafe
-from companion.core.plan import Motion
+from companion.core.trajectory import FleetTrajectory
 from companion.core.values import Phase
 
 
@@ -28,7 +28,7 @@ class PhaseChanged:
 class MotionAdopted:
     """A vehicle flies by this motion from its start on: its own proposal, a peer's, or an operator's."""
 
-    motion: Motion
+    motion: FleetTrajectory
 
 
 @dataclass(frozen=True, slots=True)

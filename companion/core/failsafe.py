@@ -12,7 +12,7 @@ class Action(Enum):
     """What a vehicle does when something fails."""
 
     CONTINUE = "continue"
-    HOLD = "hold"
+    LEAVE_FORMATION = "leave formation"
     """stand by itself, apart from the formation"""
     LAND = "land"
     """the autopilot's AUTO.LAND, where the vehicle is"""
@@ -41,7 +41,7 @@ class Failsafe(Enum):
     MISSING = "the others never come"
     ALONE = "all peers lost"
     ALONE_FOR_LONG = "all peers lost for long"
-    APART_FOR_LONG = "no way back to the formation"
+    DETACHED_FOR_LONG = "no way back to the formation"
     PEER_GONE = "a peer's companion ends"
     PEER_SILENT = "a peer falls silent"
     PEER_FROZEN = "a peer's position frozen"
@@ -119,7 +119,7 @@ FAILSAFES: dict[Failsafe, Row] = {
     Failsafe.POSITION_JUMPED: Row(
         "in the air, the first position 0.5 m or 0.5 m/s beyond what the motion explains (10 sigma of "
         "`limits.*_noise_*` if more)",
-        0.0, Action.HOLD,
+        0.0, Action.LEAVE_FORMATION,
         "where it now believes to be; the estimator's origin is asked for again, as it is after a jump on the ground",
         "3 s after the last jump it comes back to its slot",
     ),
@@ -148,17 +148,17 @@ FAILSAFES: dict[Failsafe, Row] = {
         '`peers.missing = "continue"`: those that are up form without them', _NOT,
     ),
     Failsafe.ALONE: Row(
-        "`peers.isolated_flight_s` after the last one ended or was silent for 2.1 `trigger.t_max_s`", None, Action.HOLD,
-        "", "a peer is heard: it comes back to its slot",
+        "`peers.isolated_flight_s` after the last one ended or was silent for 2.1 `trigger.t_max_s`", None,
+        Action.LEAVE_FORMATION, "", "a peer is heard: it comes back to its slot",
     ),
     Failsafe.DEAF: Row(
         "12 heartbeats due from two or more peers that are said to be there, none heard: 1.4 `trigger.t_max_s` with "
-        "ten vehicles; with few, `peers.isolated_flight_s` after 2.1", None, Action.HOLD,
+        "ten vehicles; with few, `peers.isolated_flight_s` after 2.1", None, Action.LEAVE_FORMATION,
         "the link is gone, not the peers: each is taken to fly on until it must have noticed too, then to stand",
         "a peer is heard: it comes back to its slot",
     ),
     Failsafe.ALONE_FOR_LONG: Row("`failsafe.isolated_hold_s` of that hold", None, Action.LAND, "", _NOT),
-    Failsafe.APART_FOR_LONG: Row("`peers.wait_s` apart", None, Action.LAND, "no plan was told, say", _NOT),
+    Failsafe.DETACHED_FOR_LONG: Row("`peers.wait_s` apart", None, Action.LAND, "no plan was told, say", _NOT),
     Failsafe.PEER_GONE: Row(
         "milliseconds when the process ends, the lease (4 s) when its machine or radio does", None, Action.CONTINUE,
         "all the distance is kept to everywhere it may be: flown on with the plan, or stopped", "it is heard again",

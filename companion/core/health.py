@@ -67,7 +67,7 @@ class PositionWatch:
 
 
 @dataclass(slots=True)
-class Persistence:
+class Debounce:
     """Whether something has been so for a time without a break."""
 
     limit_s: float

@@ -1,9 +1,9 @@
 """Near mode: vehicles that are near each other speak at a fixed rate, whatever the trigger says.
 
-Near is the safety filter's own measure. The filter keeps a half-plane g.u >= b for each peer (`core.safety`); -b/|g| is
-the push toward the peer (m/s^2) that would break it. A peer is near while less than PUSH_M_S2 would, and for HOLD_S
-after; of two in formation whose slots are so close themselves, once they are that much nearer than in their slots. So a
-tight formation is not near itself, and a vehicle that leaves its slot toward another is.
+Near is the safety filter's own measure. The filter (`core.safety.filter`) keeps a half-plane g.u >= b for each peer;
+-b/|g| is the push toward the peer (m/s^2) that would break it. A peer is near while less than PUSH_M_S2 would, and for
+HOLD_S after; of two in formation whose slots are so close themselves, once they are that much nearer than in their
+slots. So a tight formation is not near itself, and a vehicle that leaves its slot toward another is.
 
 A message names the peers that its sender finds near, so that those speak too: one message that arrives is enough for
 both of a pair to agree. Being named is not passed on, or two would keep each other speaking for ever.
@@ -24,7 +24,7 @@ from math import hypot
 
 from companion.core.frames import Ned
 from companion.core.monitor import PeerMotion, unheard_error_m
-from companion.core.safety import DOWNWASH_RATIO, resting_push_m_s2
+from companion.core.safety.filter import DOWNWASH_RATIO, resting_push_m_s2
 from companion.core.trigger import PeriodicTrigger, Situation
 from companion.core.values import Neighbour
 

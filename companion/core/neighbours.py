@@ -15,11 +15,11 @@ from companion.core.counts import Counts
 from companion.core.failsafe import FROZEN_S, SUSPECT_S, Failsafe
 from companion.core.frames import Ned
 from companion.core.health import MOVING_M_S
-from companion.core.hold import HoldKind, axis, weights
 from companion.core.monitor import PeerMotion
 from companion.core.near import near_bound_m
-from companion.core.plan import Moment, Programme, Reference
-from companion.core.safety import DOWNWASH_RATIO
+from companion.core.prediction import HoldKind, axis, weights
+from companion.core.safety.filter import DOWNWASH_RATIO
+from companion.core.trajectory import Reference, TrajectoryHistory, TrajectoryState
 from companion.core.values import (
     AIRBORNE_PHASES,
     FILTERED_PHASES,
@@ -33,7 +33,7 @@ from companion.core.values import (
     PeerSample,
     Phase,
 )
-from companion.core.vectors import between, nearest_on_path, off_chord, piece_about, share_of_segment
+from companion.core.vectors import closest_point_parameter, lerp, nearest_on_path, off_chord, piece_about
 
 FUTURE_LIMIT_S = 1.0
 """a sample from further ahead than this comes from a clock that is wrong"""
@@ -111,7 +111,7 @@ class PeerLimits:
     digest_size: int
 
 
-def held(
+def predict_sample(
     sample: PeerSample, reference_then: tuple[Ned, Ned], reference: Reference, fleet_ns: int, limits: PeerLimits
 ) -> tuple[Ned, Ned]:
     """Position and velocity at `fleet_ns` as a sample foretells them: what receivers use and senders compare with.
@@ -134,7 +134,7 @@ def held(
     if sample.phase in (Phase.ARMED, Phase.CLIMBING, Phase.LANDING):
         w = weights("damped", tau_s, VERTICAL_DAMPING_S)
         return Ned(p.north, p.east, p.down + w.position * v.down), Ned(0.0, 0.0, w.velocity * v.down)
-    if sample.phase in (Phase.APART, Phase.RELEASED, Phase.IDLE):
+    if sample.phase in (Phase.DETACHED, Phase.RELEASED, Phase.IDLE):
         # IDLE too: a companion that starts in flight does not steer.
         w = weights("damped", tau_s, FREE_DAMPING_S)
         k, f = w.position, w.velocity
@@ -220,7 +220,7 @@ class PeerTable:
     ids: frozenset[int]
     """every enabled vehicle's id but the own"""
     limits: PeerLimits
-    programme: Programme
+    history: TrajectoryHistory
     rejected: Counts = field(default_factory=lambda: Counts(COUNTED))
     notes: list[str] = field(default_factory=list)
     """what happened, for the log; emptied by the agent"""
@@ -395,7 +395,7 @@ class PeerTable:
         path, _ = self._path(track, max(sample.time_ns, track.stopped_ns))
         q = sample.position_ned_m
         for a, b in pairwise(path):
-            p = between(a, b, share_of_segment(q._replace(down=a.down), a, b))
+            p = lerp(a, b, closest_point_parameter(q._replace(down=a.down), a, b))
             if hypot(p.north - q.north, p.east - q.east) <= LOST_NEAR_M and q.down >= p.down - LOST_NEAR_M:
                 return True
         return False
@@ -559,15 +559,15 @@ class PeerTable:
                 track.path = []
 
     def _reference_then(self, sample: PeerSample) -> tuple[Ned, Ned]:
-        reference = self.programme.reference(sample.vehicle_id, sample.time_ns)
+        reference = self.history.reference(sample.vehicle_id, sample.time_ns)
         return reference.position_ned_m, reference.velocity_ned_m_s
 
     def _foreseen(self, sample: PeerSample, reference_then: tuple[Ned, Ned], fleet_ns: int) -> tuple[Ned, Ned]:
-        reference = self.programme.reference(sample.vehicle_id, fleet_ns)
-        return held(sample, reference_then, reference, fleet_ns, self.limits)
+        reference = self.history.reference(sample.vehicle_id, fleet_ns)
+        return predict_sample(sample, reference_then, reference, fleet_ns, self.limits)
 
     def predict(
-        self, ego_ned_m: Ned, now: Instant, moment: Moment, gated: bool, above_ground: bool = False
+        self, ego_ned_m: Ned, now: Instant, moment: TrajectoryState, gated: bool, above_ground: bool = False
     ) -> list[Neighbour]:
         """Every known peer within range, predicted to now under the plan at that `moment`, in the order of the ids.
 
@@ -575,7 +575,7 @@ class PeerTable:
         from what the others' say drop from alignment and cohesion; they still count for separation. With `above_ground`
         (before landing) the place above one that stands on the ground or lands is taken too, up to the own altitude.
         """
-        slots = self.programme.at(now.fleet_ns).slots
+        slots = self.history.at(now.fleet_ns).slots
         own = moment.slot(slots[self.own_id]).position_ned_m
         neighbours = []
         for i, peer in self._peers.items():
@@ -588,7 +588,7 @@ class PeerTable:
                 n = self._predict(peer, track, ego_ned_m, now, reference, own)
                 if above_ground and track.sample.phase in LOW_PHASES:
                     p = n.position_ned_m
-                    n = n._replace(other_end_ned_m=p._replace(down=min(p.down, ego_ned_m.down)))
+                    n = n._replace(last_seen_ned_m=p._replace(down=min(p.down, ego_ned_m.down)))
                 if self._in_range(n, ego_ned_m):
                     neighbours.append(n)
         if not gated:
@@ -602,9 +602,9 @@ class PeerTable:
 
     def _in_range(self, n: Neighbour, ego_ned_m: Ned) -> bool:
         """Whether it may be within range: for a lost peer, the nearest place between its two ends."""
-        place, other = n.position_ned_m, n.other_end_ned_m
+        place, other = n.position_ned_m, n.last_seen_ned_m
         if other is not None:
-            place = between(place, other, share_of_segment(ego_ned_m, place, other))
+            place = lerp(place, other, closest_point_parameter(ego_ned_m, place, other))
         return dist(place, ego_ned_m) <= self.limits.range_m
 
     def _predict(
@@ -623,7 +623,7 @@ class PeerTable:
             uncertainty += min(UNCERTAINTY_GROWTH_M_S * max(since_s, 0.0), UNCERTAINTY_GROWTH_MAX_M)
             position, velocity, other_end = self._lost_piece(track, ego_ned_m, now)
         else:
-            position, velocity = held(sample, track.reference_then, reference, now.fleet_ns, limits)
+            position, velocity = predict_sample(sample, track.reference_then, reference, now.fleet_ns, limits)
             if peer.due_soon:
                 uncertainty = near_bound_m(tau_s, uncertainty, limits.motion)
             if not follows and aloft(sample) and sample.phase not in FLYING_PHASES:
@@ -681,12 +681,12 @@ class PeerTable:
         sample = track.sample
         last = sample.position_ned_m
         if sample.phase not in FORMATION_PHASES:
-            slot = self.programme.reference(sample.vehicle_id, sample.time_ns).position_ned_m
+            slot = self.history.reference(sample.vehicle_id, sample.time_ns).position_ned_m
             top, ground = min(slot.down, last.down), max(0.0, last.down)
             ends = {Phase.ARMED: top, Phase.CLIMBING: top, Phase.LANDING: ground}
             if sample.phase in ends:
                 return [last, last._replace(down=ends[sample.phase])], ZERO
-            p, v = held(sample, (ZERO, ZERO), _NOWHERE, fleet_ns, self.limits)
+            p, v = predict_sample(sample, (ZERO, ZERO), _NOWHERE, fleet_ns, self.limits)
             if sample.phase is Phase.RELEASED or sample.phase in FILTERED_PHASES:
                 return [last, p], v
             return [last, p._replace(down=max(p.down, ground))], ZERO

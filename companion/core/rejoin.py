@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 
 from companion.core.frames import Ned
-from companion.core.plan import Reference, SlotChange, blend_duration_s, fading, minimum_jerk
+from companion.core.trajectory import Reference, SlotChange, blend_duration_s, fading, minimum_jerk
 from companion.core.values import ZERO
 
 
 @dataclass(slots=True)
-class OwnWay:
+class RejoinTrajectory:
     """Stands at a place; once `come_back` is called, its distance from the slot fades away, whatever the slot does.
 
     With o and w the distance and the velocity relative to the slot at the start, m the minimum-jerk polynomial and f

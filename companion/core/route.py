@@ -13,16 +13,16 @@ from dataclasses import dataclass, field
 from math import dist, hypot, inf, isfinite, pi
 from typing import NamedTuple
 
-from companion.core.fence import Fence
 from companion.core.frames import Ned
-from companion.core.plan import (
+from companion.core.safety.fence import Fence
+from companion.core.trajectory import (
     MINIMUM_JERK_BEND,
     PLAN_ACCELERATION_M_S2,
     TURN_RAMP_S,
+    FleetTrajectory,
     GotoLeg,
-    Moment,
-    Motion,
     SlotChange,
+    TrajectoryState,
     TurnLeg,
     VelocityLeg,
     leg_duration_s,
@@ -79,7 +79,7 @@ class _Span(NamedTuple):
     rate_change_rad_s2: float
 
 
-def _leg_spans(motion: Motion, k: int, since_ns: int) -> Iterator[_Span]:
+def _leg_spans(motion: FleetTrajectory, k: int, since_ns: int) -> Iterator[_Span]:
     """A leg's parts, none longer than it tells anything new; since_ns is when it begins."""
     leg, (_, p, v, _) = motion.legs[k], motion.leg_starts[k]
     duration = leg_duration_s(leg, v)
@@ -113,7 +113,7 @@ def _leg_spans(motion: Motion, k: int, since_ns: int) -> Iterator[_Span]:
             yield _Span(k, until_ns, end_ns, *ramp)
 
 
-def _spans(motion: Motion) -> Iterator[_Span]:
+def _spans(motion: FleetTrajectory) -> Iterator[_Span]:
     """The legs from the motion's start on, and what the change of formation takes besides."""
     now_ns = motion.start_ns
     for k, (since, _, _, _) in enumerate(motion.leg_starts):
@@ -145,7 +145,7 @@ def _aligned(a: Ned, b: Ned) -> bool:
 class _March:
     """One examination of a motion."""
 
-    motion: Motion
+    motion: FleetTrajectory
     fence: Fence
     allowed_m: float = 0.0
     """room that no slot may fall below"""
@@ -178,7 +178,7 @@ class _March:
 
     def least_room(self, fleet_ns: int) -> tuple[float, int]:
         """Least room of any slot at a time, and the vehicle that has it."""
-        moment = self.motion.moment(fleet_ns)
+        moment = self.motion.state_at(fleet_ns)
         self.looks += self._slots_cost
         least, vehicle = inf, 0
         for i, change in self.motion.slots.items():
@@ -202,7 +202,7 @@ class _March:
 
     def inside(self, span: _Span) -> bool:
         """Whether every slot stays inside over a span; also False once the looks are used up."""
-        moment = self.motion.moment
+        moment = self.motion.state_at
         stack = [(span.start_ns, moment(span.start_ns), span.end_ns, moment(span.end_ns))]
         while stack:
             start_ns, first, end_ns, last = stack.pop()
@@ -224,7 +224,7 @@ class _March:
                 stack += [(middle_ns, middle, end_ns, last), (start_ns, first, middle_ns, middle)]
         return True
 
-    def _all_inside(self, first: Moment, last: Moment, strip: float) -> bool:
+    def _all_inside(self, first: TrajectoryState, last: TrajectoryState, strip: float) -> bool:
         """Whether a strip about the centre's way that is wide enough for every slot is inside."""
         a, b = first.centre.position, last.centre.position
         fence, need = self.fence, self.allowed_m + strip
@@ -236,7 +236,7 @@ class _March:
             and fence.edge_room_along_m(a.north, a.east, b.north, b.east) - self._level_m >= need
         )  # fmt: skip
 
-    def _slots_inside(self, first: Moment, last: Moment, strip: float) -> tuple[float, float]:
+    def _slots_inside(self, first: TrajectoryState, last: TrajectoryState, strip: float) -> tuple[float, float]:
         """Least room of the strips about the slots' ways, and how wide or (beside a notch) how long what may be halved
         is."""
         self.looks += 2.0 * self._slots_cost
@@ -252,7 +252,7 @@ class _March:
                 wide = max(wide, hypot(b.north - a.north, b.east - a.east))
         return least - strip, wide
 
-    def _ends_inside(self, first: Moment, last: Moment) -> bool:
+    def _ends_inside(self, first: TrajectoryState, last: TrajectoryState) -> bool:
         self.looks += self._slots_cost
         return all(
             self.fence.room_m(moment.slot(change).position_ned_m) >= self.allowed_m
@@ -277,7 +277,7 @@ class _March:
         return worst
 
 
-def first_breach(motion: Motion, fence: Fence | None) -> Breach | None:
+def first_breach(motion: FleetTrajectory, fence: Fence | None) -> Breach | None:
     """The first leg that leads a slot beyond the fence's margin, with the worst of that leg; None if all stay inside.
 
     A motion that starts beyond the margin is a way back if it ends no further out, whatever it passes: the safety
@@ -286,7 +286,7 @@ def first_breach(motion: Motion, fence: Fence | None) -> Breach | None:
     return None if fence is None or not motion.slots else examined(motion, fence)[0]
 
 
-def examined(motion: Motion, fence: Fence) -> tuple[Breach | None, float]:
+def examined(motion: FleetTrajectory, fence: Fence) -> tuple[Breach | None, float]:
     """`first_breach` of a motion with slots, and the looks that it took."""
     march = _March(motion, fence)
     room, _ = march.least_room(motion.start_ns)
@@ -310,18 +310,18 @@ def examined(motion: Motion, fence: Fence) -> tuple[Breach | None, float]:
     return None, march.looks
 
 
-def only_stops(motion: Motion, before: Motion) -> bool:
+def only_stops(motion: FleetTrajectory, before: FleetTrajectory) -> bool:
     """Whether a motion does nothing but bring the formation of the one before to rest: that is never refused."""
     rests = all(isinstance(leg, VelocityLeg) and leg.velocity_ned_m_s == ZERO for leg in motion.legs)
     return bool(motion.legs) and rests and motion.slots == before.slots
 
 
-def slots_apart_m(motion: Motion) -> float:
+def slots_apart_m(motion: FleetTrajectory) -> float:
     """The least distance of two slots from the motion's start to the end of its change of formation (m).
 
     All pass from before to after by the same share at a time, so that two slots' offset moves on a straight line.
     """
-    gone = motion.moment(motion.start_ns).blend[0]
+    gone = motion.state_at(motion.start_ns).blend[0]
     now = [(_between(change, gone), change.after) for change in motion.slots.values()]
     least2 = inf
     for k, (a, a_after) in enumerate(now):
@@ -337,9 +337,9 @@ def slots_apart_m(motion: Motion) -> float:
     return least2**0.5 if isfinite(least2) else inf
 
 
-def slots_continue(motion: Motion, before: Motion, tolerance_m: float) -> bool:
+def slots_continue(motion: FleetTrajectory, before: FleetTrajectory, tolerance_m: float) -> bool:
     """Whether a motion's slots begin where those of the one before are then."""
-    gone, there = (m.moment(motion.start_ns).blend[0] for m in (motion, before))
+    gone, there = (m.state_at(motion.start_ns).blend[0] for m in (motion, before))
     return all(
         dist(_between(change, gone), _between(before.slots[i], there)) <= tolerance_m
         for i, change in motion.slots.items()

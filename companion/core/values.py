@@ -37,7 +37,7 @@ class Phase(IntEnum):
     """the formation stands, after it has moved or on command"""
     RETURNING = 9
     """on the way to the places over the pads"""
-    APART = 10
+    DETACHED = 10
     """stands by itself or comes back to its slot: steered by its own filter, and no part of the formation"""
     LANDING = 11
     LANDED = 12
@@ -47,7 +47,7 @@ class Phase(IntEnum):
 
 FORMATION_PHASES = frozenset({Phase.WAITING, Phase.FORMING, Phase.FORMED, Phase.MOVING, Phase.HOLDING, Phase.RETURNING})
 """phases in which a vehicle follows its slot, so that a pair shares the avoidance"""
-FILTERED_PHASES = FORMATION_PHASES | {Phase.APART}
+FILTERED_PHASES = FORMATION_PHASES | {Phase.DETACHED}
 """phases in which a vehicle's own safety filter steers it"""
 SETTLED_PHASES = frozenset({Phase.FORMED, Phase.MOVING, Phase.HOLDING})
 """phases of a vehicle that has taken its slot"""
@@ -118,7 +118,7 @@ class Neighbour(NamedTuple):
     """its own safety filter is active, so that each of the pair takes half"""
     uncertainty_m: float
     """how far from the prediction it may be"""
-    other_end_ned_m: Ned | None = None
+    last_seen_ned_m: Ned | None = None
     """where a lost peer may stand instead; it is anywhere between the two"""
     reference_velocity_ned_m_s: Ned = ZERO
     """what the plan asks of its slot: differs from the own slot's while slots turn or move"""
@@ -137,7 +137,7 @@ class Command(NamedTuple):
 
 
 class SafeSetpoint(NamedTuple):
-    """What may be sent to an autopilot. Only `core.safety` makes one."""
+    """What may be sent to an autopilot. Only `core.safety.filter` makes one."""
 
     velocity_north_m_s: float
     velocity_east_m_s: float

@@ -6,7 +6,7 @@ from math import dist, inf
 from companion.core.frames import Ned
 
 
-def share_of_segment(position: Ned, a: Ned, b: Ned, vertical_ratio: float = 1.0) -> float:
+def closest_point_parameter(position: Ned, a: Ned, b: Ned, vertical_ratio: float = 1.0) -> float:
     """How far along from a (0) to b (1) the place nearest to `position` is, vertical lengths divided by the ratio."""
     north, east, down = b.north - a.north, b.east - a.east, (b.down - a.down) / vertical_ratio**2
     length2 = north * north + east * east + down * (b.down - a.down)
@@ -16,7 +16,7 @@ def share_of_segment(position: Ned, a: Ned, b: Ned, vertical_ratio: float = 1.0)
     return min(max(along / length2, 0.0), 1.0)
 
 
-def between(a: Ned, b: Ned, share: float) -> Ned:
+def lerp(a: Ned, b: Ned, share: float) -> Ned:
     """The place that far along from a (0) to b (1)."""
     return Ned(
         a.north + share * (b.north - a.north), a.east + share * (b.east - a.east), a.down + share * (b.down - a.down)
@@ -28,8 +28,8 @@ def nearest_on_path(position: Ned, path: Sequence[Ned], vertical_ratio: float) -
     best, found = inf, (0, 0.0)
     for k in range(len(path) - 1):
         a, b = path[k], path[k + 1]
-        share = share_of_segment(position, a, b, vertical_ratio)
-        p = between(a, b, share)
+        share = closest_point_parameter(position, a, b, vertical_ratio)
+        p = lerp(a, b, share)
         distance2 = (
             (p.north - position.north) ** 2
             + (p.east - position.east) ** 2
@@ -43,7 +43,7 @@ def nearest_on_path(position: Ned, path: Sequence[Ned], vertical_ratio: float) -
 def off_chord(path: Sequence[Ned]) -> float:
     """How far the points of a path are from the straight line between its ends, at most (m)."""
     a, b = path[0], path[-1]
-    return max(dist(p, between(a, b, share_of_segment(p, a, b))) for p in path)
+    return max(dist(p, lerp(a, b, closest_point_parameter(p, a, b))) for p in path)
 
 
 def piece_about(path: Sequence[Ned], edge: int, share: float, half_m: float) -> tuple[Ned, Ned, float]:
@@ -57,6 +57,6 @@ def piece_about(path: Sequence[Ned], edge: int, share: float, half_m: float) -> 
     at_m = share * length
     forward = half_m if edge < len(path) - 2 else min(half_m, length - at_m)
     backward = half_m if edge > 0 else min(half_m, at_m)
-    front = between(a, b, (at_m + forward) / length)
-    back = between(a, b, (at_m - backward) / length)
+    front = lerp(a, b, (at_m + forward) / length)
+    back = lerp(a, b, (at_m - backward) / length)
     return front, back, forward / max(forward + backward, 1e-9)

@@ -14,15 +14,15 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from companion.autopilot import AutopilotClient
 from companion.config import FleetConfig, Vehicle
 from companion.errors import CompanionError
 from companion.io.clock import FleetClock
 from companion.io.link import Link, open_link
 from companion.io.loop import network_settings
 from companion.io.zenoh_peers import OperatorLink
-from companion.preflight import Check, own_checks, tidy
-from companion.wire.mavlink import MavlinkLink
+from companion.vehicle.autopilot.client import AutopilotClient
+from companion.vehicle.preflight import Check, own_checks, tidy
+from companion.wire.mavlink import MavlinkCodec
 
 FREE_LEAST_GB = 1.0
 """a recording takes 25 MB for half an hour; nobody deletes the old ones"""
@@ -64,7 +64,7 @@ def _autopilot(config: FleetConfig, vehicle: Vehicle, seconds: float) -> Iterato
     try:
         yield Check("link", vehicle.mavlink, "opens", True, "")
         origin = config.origin if config.fleet.frame == "global" else None
-        client = AutopilotClient(MavlinkLink(vehicle.system_id), origin, config.limits.control_rate_hz)
+        client = AutopilotClient(MavlinkCodec(vehicle.system_id), origin, config.limits.control_rate_hz)
         clock = FleetClock()
         received = listen(link, client, clock, seconds)
         yield Check("bytes", received, "> 0", received > 0, f"nothing came on {vehicle.mavlink} in {seconds:g} s")

@@ -44,7 +44,7 @@ def received_unix_ns(ancillary: list[tuple[int, int, bytes]]) -> int:
 class Link(Protocol):
     """What the loop needs of a link."""
 
-    strangers: int
+    foreign_datagrams: int
     """datagrams from elsewhere while the autopilot's address was known"""
     send_failures: int
 
@@ -94,7 +94,7 @@ class UdpLink:
             raise CompanionError(f"cannot listen on UDP {host}:{port}: {why}") from error
         self._autopilot: Address | None = None
         self._heard_ns = 0
-        self.strangers = 0
+        self.foreign_datagrams = 0
         """datagrams from elsewhere while the autopilot's address was known"""
         self.send_failures = 0
 
@@ -119,7 +119,7 @@ class UdpLink:
         """Whether a datagram from there may be the autopilot's; strangers are counted."""
         known = self._autopilot is not None and received_ns - self._heard_ns < ADDRESS_LIMIT_NS
         if known and address != self._autopilot:
-            self.strangers += 1
+            self.foreign_datagrams += 1
             return False
         return True
 
@@ -158,7 +158,7 @@ class SerialLink:
             known = sorted(int(n[1:]) for n in dir(termios) if n[:1] == "B" and n[1:].isdigit() and n != "B0")
             raise CompanionError(f"serial line {device}: {baud} baud is not one of {', '.join(map(str, known))}")
         self._speed: int = speed
-        self.strangers = 0
+        self.foreign_datagrams = 0
         self.send_failures = 0
         """frames not sent: the line was gone, or slower than what was to be sent"""
         self._unsent = b""

@@ -21,8 +21,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from companion.agent import Agent, Outputs
-from companion.border import Border
 from companion.config import FleetConfig
 from companion.core.failsafe import CONFIGURATION_S, Failsafe
 from companion.core.values import Instant
@@ -33,7 +31,9 @@ from companion.io.recorder import Recorder
 from companion.io.systemd import Notifier
 from companion.io.traffic import tcp_bytes_sent
 from companion.io.zenoh_peers import PeerMessage, PeerNetwork, PeerNetworkSettings, PresenceChange, Request
-from companion.preflight import ClockReading
+from companion.vehicle.agent import Agent, Outputs
+from companion.vehicle.border import Border
+from companion.vehicle.preflight import ClockReading
 from companion.wire.events import encode_event
 
 TICK_RECORD = struct.Struct("<qqqff?6f")
@@ -261,7 +261,7 @@ class Companion:
         sent_ns = time.monotonic_ns()
         for topic, payload in out.peers:
             self.network.publish(topic, payload)
-        self._notifier.turned(sent_ns)
+        self._notifier.loop_turned(sent_ns)
         self._after(out, now, sent_ns, deadline_ns)
 
     def _tell_raised(self, now_ns: int) -> None:
@@ -322,7 +322,7 @@ class Companion:
         status["dropped"] = counters.dropped
         status["recorder_lost"] = 0 if self.recorder is None else self.recorder.lost
         elsewhere = {
-            "mavlink: another address than the autopilot's": self.link.strangers,
+            "mavlink: another address than the autopilot's": self.link.foreign_datagrams,
             "mavlink: could not be sent": self.link.send_failures,
             "peer: malformed": counters.malformed,
         }

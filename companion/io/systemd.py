@@ -32,7 +32,7 @@ class Notifier:
         """The loop runs."""
         self._send("READY=1")
 
-    def turned(self, now_ns: int) -> None:
+    def loop_turned(self, now_ns: int) -> None:
         """The agent was advanced and what it wants was sent; to be called from there and nowhere else."""
         if self._period_ns > 0 and now_ns >= self._next_ns:
             self._next_ns = now_ns + self._period_ns

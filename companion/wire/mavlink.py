@@ -247,7 +247,7 @@ STREAMS_OFF = (30, 31, 33, 105, 331, 111, 141, 132, 83, 85, 36, 74, 24, 87)
 class FrameSplitter:
     """Cuts a byte stream (a serial line) into frames, each as it would be a datagram; noise between them is dropped.
 
-    A frame counts once it is whole and another, or nothing yet, follows it; its checksum is `MavlinkLink`'s to check.
+    A frame counts once it is whole and another, or nothing yet, follows it; its checksum is `MavlinkCodec`'s to check.
     """
 
     def __init__(self) -> None:
@@ -290,7 +290,7 @@ def _frame_length(buffer: bytearray, begin: int) -> int | None:
     return 0
 
 
-class MavlinkLink:
+class MavlinkCodec:
     """Codec of one vehicle's link: decodes what its autopilot says, encodes what the companion says."""
 
     def __init__(self, system_id: int) -> None:

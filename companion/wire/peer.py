@@ -18,7 +18,17 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from companion.core.frames import Ned
-from companion.core.motion_check import (
+from companion.core.trajectory import (
+    BLEND_MIN_S,
+    GOTO_MIN_S,
+    FleetTrajectory,
+    GotoLeg,
+    Leg,
+    SlotChange,
+    TurnLeg,
+    VelocityLeg,
+)
+from companion.core.trajectory_check import (
     DURATION_MAX_S,
     HEADING_MAX_RAD,
     LEGS_MAX,
@@ -31,7 +41,6 @@ from companion.core.motion_check import (
     VEHICLES_MAX,
     VELOCITY_MAX_M_S,
 )
-from companion.core.plan import BLEND_MIN_S, GOTO_MIN_S, GotoLeg, Leg, Motion, SlotChange, TurnLeg, VelocityLeg
 from companion.core.values import PeerMessage, PeerSample, Phase
 from companion.errors import WireError
 
@@ -105,8 +114,8 @@ def _sample(payload: bytes, at: int, vehicle_id: int, phase: int, revision: int)
     return PeerSample(vehicle_id, time_ns, Ned(*numbers[:3]), Ned(*numbers[3:]), revision, known)
 
 
-# The bounds on a motion's single values: `core.motion_check` has them for the file and for the wire, with what a whole
-# one must keep. Within them its arithmetic neither overflows nor divides by nothing.
+# The bounds on a motion's single values: `core.trajectory_check` has them for the file and for the wire, with what a
+# whole one must keep. Within them its arithmetic neither overflows nor divides by nothing.
 _Metres = Annotated[float, Field(ge=-PLACE_MAX_M, le=PLACE_MAX_M, allow_inf_nan=False)]
 _MetresPerSecond = Annotated[float, Field(ge=-VELOCITY_MAX_M_S, le=VELOCITY_MAX_M_S, allow_inf_nan=False)]
 _Place = tuple[_Metres, _Metres, _Metres]
@@ -162,7 +171,7 @@ class _Motion(_Model):
     then: Literal["stay", "land", "return"]
 
 
-def encode_motion(motion: Motion) -> bytes:
+def encode_motion(motion: FleetTrajectory) -> bytes:
     """A motion as JSON; floats survive exactly."""
     legs = []
     for leg in motion.legs:
@@ -178,7 +187,7 @@ def encode_motion(motion: Motion) -> bytes:
     return json.dumps({"version": VERSION, **fields, "legs": legs}, separators=(",", ":")).encode()
 
 
-def decode_motion(payload: bytes) -> Motion:
+def decode_motion(payload: bytes) -> FleetTrajectory:
     """A motion from JSON; WireError for anything that is not exactly one, with single values within their bounds."""
     if len(payload) > MOTION_BYTES_MAX:
         raise WireError("motion", f"has {len(payload)} bytes, may have {MOTION_BYTES_MAX}")
@@ -201,7 +210,7 @@ def decode_motion(payload: bytes) -> Motion:
                 legs.append(TurnLeg(leg.rate_rad_s, float("inf") if leg.angle_rad is None else leg.angle_rad))
             case _GotoLeg():
                 legs.append(GotoLeg(Ned(*leg.target_ned_m), leg.duration_s))
-    return Motion(
+    return FleetTrajectory(
         revision=m.revision, start_ns=m.start_ns, issuer=m.issuer, shape=m.shape,
         slots={i: SlotChange(Ned(*a), Ned(*b)) for i, (a, b) in m.slots.items()},
         blend_start_ns=m.blend_start_ns, blend_s=m.blend_s, legs_start_ns=m.legs_start_ns,

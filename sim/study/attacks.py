@@ -9,7 +9,7 @@ from math import cos, inf, pi, sin
 from random import Random
 
 from companion.core.frames import Ned
-from companion.core.plan import GotoLeg, Leg, Motion, SlotChange, TurnLeg, VelocityLeg, with_legs
+from companion.core.trajectory import FleetTrajectory, GotoLeg, Leg, SlotChange, TurnLeg, VelocityLeg, with_legs
 from companion.core.values import ZERO, PeerMessage, PeerSample, Phase
 from companion.wire.peer import decode_state, encode_motion, encode_state
 
@@ -22,23 +22,23 @@ SEQUENCE_LEAP = (1 << 31) - 5
 """the largest step of a sequence number that counts as newer, nearly"""
 
 
-def forged_plan(kind: str, newest: Motion, issuer: int, now_ns: int, random: Random) -> bytes:
+def forged_plan(kind: str, newest: FleetTrajectory, issuer: int, now_ns: int, random: Random) -> bytes:
     """A plan that takes over from `newest`, hostile in the way that `kind` names."""
     plain = with_legs(newest, at_ns=now_ns + START_NS, issuer=issuer, legs=())
     return encode_motion(PLANS[kind](plain, random))
 
 
-def _legs(*legs: Leg) -> Callable[[Motion, Random], Motion]:
+def _legs(*legs: Leg) -> Callable[[FleetTrajectory, Random], FleetTrajectory]:
     return lambda plain, _: replace(plain, legs=legs)
 
 
-def _every_slot(plain: Motion, before: bool, after: bool) -> Motion:
+def _every_slot(plain: FleetTrajectory, before: bool, after: bool) -> FleetTrajectory:
     """All vehicles to the centre, before the blend or after it."""
     slots = {i: SlotChange(ZERO if before else s.before, ZERO if after else s.after) for i, s in plain.slots.items()}
     return replace(plain, slots=slots, blend_start_ns=plain.start_ns, blend_s=3.0 if after else 3600.0)
 
 
-def _exchanged(plain: Motion, random: Random) -> Motion:
+def _exchanged(plain: FleetTrajectory, random: Random) -> FleetTrajectory:
     """Every vehicle into another's slot, within a tenth of a second."""
     ids = list(plain.slots)
     turn = random.randrange(1, len(ids)) if len(ids) > 1 else 0
@@ -47,19 +47,19 @@ def _exchanged(plain: Motion, random: Random) -> Motion:
     return replace(plain, slots=slots, blend_start_ns=plain.start_ns, blend_s=0.1)
 
 
-def _at_another_time(plain: Motion, random: Random) -> Motion:
+def _at_another_time(plain: FleetTrajectory, random: Random) -> FleetTrajectory:
     """Under way for an hour, or an hour from now: where it leads to is long over, or never comes."""
     apart_ns = random.choice((-3590, 3590)) * SECOND_NS
     legs = (VelocityLeg(Ned(0.2, 0.0, 0.0), 30.0),)
     return replace(plain, start_ns=plain.start_ns + apart_ns, legs_start_ns=plain.start_ns + apart_ns, legs=legs)
 
 
-def _leaping(plain: Motion, random: Random) -> Motion:
+def _leaping(plain: FleetTrajectory, random: Random) -> FleetTrajectory:
     """A revision that leaves no room for another, or as little as is let through."""
     return replace(plain, revision=random.choice(((1 << 32) - 1, plain.revision + 9_999)))
 
 
-PLANS: Mapping[str, Callable[[Motion, Random], Motion]] = {
+PLANS: Mapping[str, Callable[[FleetTrajectory, Random], FleetTrajectory]] = {
     "out of the fence": _legs(VelocityLeg(Ned(2.0, 0.0, 0.0), 60.0)),
     "into the ground": _legs(GotoLeg(Ned(0.0, 0.0, 5.0), 10.0)),
     "too fast": _legs(VelocityLeg(Ned(0.0, 15.0, 0.0), 5.0)),

@@ -14,14 +14,14 @@ import numpy as np
 
 from companion.config import FleetConfig, parse
 from companion.core.failsafe import Failsafe
-from companion.core.safety import COLLISION_DISTANCE_M as COLLISION_M
+from companion.core.safety.filter import COLLISION_DISTANCE_M as COLLISION_M
 from companion.core.values import FLYING_PHASES, Instant, Phase
 from companion.errors import ConfigError
-from companion.flight import ON_GROUND
+from companion.vehicle.flight import ON_GROUND
 from companion.wire.mavlink import Px4Mode
-from sim.lockstep import Lockstep, Vehicle
-from sim.network import NetworkParameters
-from sim.px4.faults import Fault, FaultKind
+from sim.autopilot.faults import Fault, FaultKind
+from sim.lockstep.lockstep import Lockstep, Vehicle
+from sim.lockstep.network import NetworkParameters
 from sim.study.attacks import PLANS, STATES, forged_plan, forged_state
 from sim.study.common import FLYING_CODE, Column, Config, Outcome, Record, Table, load_config, proportion_text, table_of
 
@@ -33,7 +33,7 @@ ESTIMATE_FAULTS = frozenset({"gps_lost", "position_frozen", "estimator_reset", "
 HANDED_OVER = frozenset({Px4Mode.AUTO_LOITER, Px4Mode.POSCTL})
 """the autopilot's hold, and the pilot's: who flies in them without a companion is in somebody's hands"""
 _F = Failsafe
-OF_THE_FLEET = frozenset({_F.MISSING, _F.ALONE, _F.DEAF, _F.ALONE_FOR_LONG, _F.APART_FOR_LONG})
+OF_THE_FLEET = frozenset({_F.MISSING, _F.ALONE, _F.DEAF, _F.ALONE_FOR_LONG, _F.DETACHED_FOR_LONG})
 """failsafes that a fault of another, or of the network, explains"""
 _NO_POSITION = {_F.POSITION_LOST, _F.POSITION_JUMPED, _F.AUTOPILOT, _F.NOT_ARMED, _F.NO_TAKE_OFF}
 """no position, then one elsewhere; without setpoints the autopilot acts too"""
@@ -238,7 +238,7 @@ def _inject(ls: Lockstep, fault: Drawn, random: Random, ear: _Ear) -> None:
             others = [j for j in ls.vehicles if j != i]
             ls.add_twin(i, line_of=random.choice(others) if fault.magnitude == "on another's line" else None)
         case "forged_plan":
-            newest = max((v.agent.programme.newest for v in ls.vehicles.values()), key=lambda motion: motion.order)
+            newest = max((v.agent.history.newest for v in ls.vehicles.values()), key=lambda motion: motion.order)
             payload = forged_plan(str(fault.magnitude), newest, i, ls.now.fleet_ns, random)
             ls.inject_peer(f"fleet/{i}/plan", payload)
         case "forged_digest":

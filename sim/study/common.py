@@ -21,8 +21,8 @@ import numpy.typing as npt
 from scipy.stats import beta
 
 from companion.errors import ConfigError
-from sim import swarm
-from sim.swarm import Run, Setup, setup_from
+from sim.swarm import swarm
+from sim.swarm.swarm import Run, Setup, setup_from
 
 Floats = npt.NDArray[np.float64]
 Record = dict[str, Any]

@@ -7,7 +7,7 @@ import numpy as np
 from sim.study.common import Column, Config, Figure, Outcome, Record, Table, statistics
 from sim.study.figures import BLUE, GREY, RED, panels, snapshots, trajectories_3d
 from sim.study.paper import at, error_curves, example_record, first_run, per_axis_rms_m
-from sim.swarm import run
+from sim.swarm.swarm import run
 
 TITLE = "Example 1: fifteen UAVs in a spiral"
 TIMES_S = (0.0, 5.0, 10.0, 15.0)

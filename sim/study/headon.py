@@ -15,15 +15,15 @@ import numpy as np
 
 from companion.config import FleetConfig, parse
 from companion.core.frames import Ned
-from companion.core.safety import COLLISION_DISTANCE_M as COLLISION_M
+from companion.core.safety.filter import COLLISION_DISTANCE_M as COLLISION_M
 from companion.core.values import Phase
 from companion.errors import ConfigError
-from sim.broken_law import BrokenLaw
-from sim.lockstep import Lockstep
-from sim.network import NetworkParameters
-from sim.never_near import NeverNear
+from sim.lockstep.lockstep import Lockstep
+from sim.lockstep.network import NetworkParameters
+from sim.study.broken_law import BrokenLaw
 from sim.study.common import FLYING_CODE, Column, Config, Figure, Outcome, Record, Table, proportion_text, table_of
 from sim.study.figures import BLUE, GREEN, GREY, RED, panels
+from sim.study.never_near import NeverNear
 
 TITLE = "Head-on by a broken law: lag, delay and loss"
 SOURCES = FLYING_CODE

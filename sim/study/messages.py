@@ -9,15 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from companion.agent import CAUSES
 from companion.config import FleetConfig, load
 from companion.core.monitor import minimum_distance_m
 from companion.core.values import Phase
 from companion.errors import ConfigError
-from sim.lockstep import Lockstep
-from sim.network import NetworkParameters
-from sim.never_near import NeverNear
+from companion.vehicle.agent import CAUSES
+from sim.lockstep.lockstep import Lockstep
+from sim.lockstep.network import NetworkParameters
 from sim.study.common import FLYING_CODE, Column, Config, Outcome, Record, Table, table_of
+from sim.study.never_near import NeverNear
 
 TITLE = "Messages of the shipped fleet's flight, by cause"
 FLEET = Path(__file__).parents[2] / "fleet.toml"

@@ -5,7 +5,7 @@ from typing import Any
 
 from sim.study.common import Column, Config, Figure, Outcome, Record, Table, measured, over_seeds
 from sim.study.figures import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, panels
-from sim.swarm import run
+from sim.swarm.swarm import run
 
 TITLE = "Messages against error: ours, 20 Hz, and everything between"
 KEYS = (

@@ -19,7 +19,7 @@ from sim.study.common import (
     write_outcome,
 )  # fmt: skip
 from sim.study.report import write_report
-from sim.swarm import kernels
+from sim.swarm.swarm import kernels
 
 DEFAULT_SEEDS = "0..19"
 JUDGED_SEEDS = "20..39"

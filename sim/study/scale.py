@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from companion.core.intent import IntentGains
+from companion.core.law.intent import IntentGains
 from companion.core.trigger import ErrorTrigger
-from sim import swarm
 from sim.study.common import Column, Config, Figure, Outcome, Record, Table, statistics
 from sim.study.figures import BLUE, GREEN, GREY, RED, panels
-from sim.swarm import NeighbourList, Setup, kernels, reference_table, run, starts
+from sim.swarm import swarm
+from sim.swarm.swarm import NeighbourList, Setup, kernels, reference_table, run, starts
 
 TITLE = "Scale: what a step costs, how long a swarm takes to form"
 BAR_MS = 20.0

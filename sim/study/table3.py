@@ -7,7 +7,7 @@ import numpy as np
 
 from sim.study.common import Column, Config, Figure, Outcome, Record, Table, measured, over_seeds
 from sim.study.figures import BLUE, CYCLE, GREY, RED, panels
-from sim.swarm import run
+from sim.swarm.swarm import run
 
 TITLE = "Table 3: six UAVs, 15 s"
 KEYS = (

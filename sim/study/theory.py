@@ -10,7 +10,7 @@ import numpy.typing as npt
 from companion.core.monitor import algebraic_connectivity
 from sim.study.common import Column, Config, Figure, Outcome, Record, Table, proportion_interval, statistics
 from sim.study.figures import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, panels
-from sim.swarm import Run, Setup, run, setup_from
+from sim.swarm.swarm import Run, Setup, run, setup_from
 
 TITLE = "Theory: what the proof says and what happens"
 Floats = npt.NDArray[np.float64]

@@ -10,7 +10,7 @@ from collections import Counter
 from pathlib import Path
 
 from companion.io.recorder import read_recording
-from companion.replay import replay_file
+from companion.io.replay import replay_file
 
 RECORDING = Path(__file__).parent / "px4_flight.mcap"
 SIZE_MAX = 2_000_000

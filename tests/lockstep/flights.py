@@ -13,11 +13,11 @@ import numpy.typing as npt
 from pymavlink.dialects.v20 import development as dialect
 
 from companion.config import FleetConfig, load
-from companion.core.plan import Programme
+from companion.core.trajectory import TrajectoryHistory
 from companion.core.values import Instant, Phase
 from companion.io.recorder import Entry
-from sim.lockstep import UTC_AT_START_NS, Lockstep
-from sim.network import NetworkParameters
+from sim.lockstep.lockstep import UTC_AT_START_NS, Lockstep
+from sim.lockstep.network import NetworkParameters
 
 DEFAULT = Path(__file__).resolve().parents[2] / "fleet.toml"
 READY_S = 3.0
@@ -134,15 +134,15 @@ def distances(t: Truth, ids: Iterable[int] | None = None) -> Array:
     return np.asarray(np.linalg.norm(p[:, a] - p[:, b], axis=2))
 
 
-def errors(ls: Lockstep, t: Truth, ids: Iterable[int], programme: Programme | None = None) -> tuple[Array, Array]:
+def errors(ls: Lockstep, t: Truth, ids: Iterable[int], history: TrajectoryHistory | None = None) -> tuple[Array, Array]:
     """Formation error about the centroid and the centroid's error against the plan (m), over time."""
     chosen = list(ids)
     columns = [t.column(i) for i in chosen]
-    plan = programme or ls.vehicles[chosen[0]].agent.programme
+    plan = history or ls.vehicles[chosen[0]].agent.history
     formation, centroid = [], []
     for time_ns, p in zip(t.times_ns, t.position_ned_m[:, columns], strict=True):
         motion = plan.at(int(time_ns))
-        moment = motion.moment(int(time_ns))
+        moment = motion.state_at(int(time_ns))
         e = p - np.array([moment.slot(motion.slots[i]).position_ned_m for i in chosen])
         formation.append(np.sqrt(np.square(e - e.mean(axis=0)).sum(axis=1).mean()))
         centroid.append(np.linalg.norm(e.mean(axis=0)))

@@ -13,7 +13,19 @@ from typing import Any, Literal, NamedTuple
 
 from companion.config import FleetConfig
 from companion.core.frames import Ned
-from companion.core.motion_check import (
+from companion.core.trajectory import (
+    BLEND_MIN_S,
+    GOTO_MIN_S,
+    PADS,
+    FleetTrajectory,
+    GotoLeg,
+    Leg,
+    SlotChange,
+    TurnLeg,
+    VelocityLeg,
+    with_legs,
+)
+from companion.core.trajectory_check import (
     DURATION_MAX_S,
     LEGS_MAX,
     PLACE_MAX_M,
@@ -22,18 +34,6 @@ from companion.core.motion_check import (
     TURN_RATE_MAX_RAD_S,
     TURN_RATE_MIN_RAD_S,
     VELOCITY_MAX_M_S,
-)
-from companion.core.plan import (
-    BLEND_MIN_S,
-    GOTO_MIN_S,
-    PADS,
-    GotoLeg,
-    Leg,
-    Motion,
-    SlotChange,
-    TurnLeg,
-    VelocityLeg,
-    with_legs,
 )
 from companion.core.values import ZERO, PeerMessage, PeerSample, Phase
 from companion.wire.peer import PLAUSIBLE_MAX, encode_motion, encode_state
@@ -58,7 +58,7 @@ class Inputs:
         self.ids = [v.id for v in config.vehicles]
         self.orders = 0
 
-    def one(self, newest: Motion, fleet_ns: int) -> Input:
+    def one(self, newest: FleetTrajectory, fleet_ns: int) -> Input:
         """Whatever comes next, given the newest motion and the time of whom it is for."""
         r = self.random
         about = r.choice(self.ids)
@@ -109,7 +109,7 @@ class Inputs:
             case _:
                 return GotoLeg(self.place(), r.choice([GOTO_MIN_S, 30.0, 120.0, self.number(60.0, DURATION_MAX_S)]))
 
-    def motion(self, newest: Motion, fleet_ns: int) -> Motion:
+    def motion(self, newest: FleetTrajectory, fleet_ns: int) -> FleetTrajectory:
         """An honest successor of the newest motion, mostly with some of its values changed."""
         r = self.random
         at_ns = fleet_ns + r.choice([2_000_000_000, 3_000_000_000, 0, -5_000_000_000, 3_500_000_000_000])
@@ -126,7 +126,7 @@ class Inputs:
             motion = self.changed(motion, fleet_ns)
         return replace(motion, then="stay") if motion.then == "land" or motion.shape == PADS else motion
 
-    def changed(self, motion: Motion, fleet_ns: int) -> Motion:
+    def changed(self, motion: FleetTrajectory, fleet_ns: int) -> FleetTrajectory:
         """The same with one value changed."""
         r = self.random
         slot = r.choice(list(motion.slots))
@@ -154,7 +154,7 @@ class Inputs:
 
     # -- messages and commands ---------------------------------------------------------------------------------------
 
-    def sample(self, about: int, newest: Motion, fleet_ns: int) -> PeerSample:
+    def sample(self, about: int, newest: FleetTrajectory, fleet_ns: int) -> PeerSample:
         r = self.random
         place = newest.reference(about, fleet_ns).position_ned_m if about in newest.slots else ZERO
         spread = r.choice([0.0, 0.3, 3.0, 300.0, PLAUSIBLE_MAX - 1e5])
@@ -165,7 +165,7 @@ class Inputs:
             r.choice([newest.revision, 0, newest.revision + 1, 2**32 - 1]), r.choice(list(Phase)),
         )  # fmt: skip
 
-    def message(self, about: int, newest: Motion, fleet_ns: int) -> PeerMessage:
+    def message(self, about: int, newest: FleetTrajectory, fleet_ns: int) -> PeerMessage:
         """A peer's state with a digest, true or not."""
         r = self.random
         digest = tuple(
@@ -177,7 +177,7 @@ class Inputs:
             self.sample(about, newest, fleet_ns), digest,
         )  # fmt: skip
 
-    def command(self, newest: Motion, fleet_ns: int) -> bytes:
+    def command(self, newest: FleetTrajectory, fleet_ns: int) -> bytes:
         """An operator's command; one that would end a flight has something wrong with it."""
         r = self.random
         self.orders += r.choice([0, 1, 1])

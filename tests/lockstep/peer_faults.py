@@ -9,10 +9,10 @@ from flights import distances, fleet, launch, set_parameter, truth, until, until
 
 from companion.core.frames import Ned
 from companion.core.values import ZERO, PeerMessage, PeerSample, Phase
-from companion.core.vectors import between
-from companion.flight import ON_GROUND
+from companion.core.vectors import lerp
+from companion.vehicle.flight import ON_GROUND
 from companion.wire.peer import encode_state
-from sim.lockstep import Lockstep
+from sim.lockstep.lockstep import Lockstep
 
 TURN: list[dict[str, object]] = [{"kind": "turn", "rate_deg_s": 6.0}]
 
@@ -64,7 +64,7 @@ def restarted(shape: str, seed: int, line: bool, stops: bool = True) -> tuple[fl
     ls = moving(
         5, shape, seed, [{"kind": "velocity", "north_m_s": 1.0, "duration_s": 25.0}], 3.0 if shape == "column" else 4.0
     )
-    slots = ls.vehicles[1].agent.programme.newest.slots
+    slots = ls.vehicles[1].agent.history.newest.slots
     order = sorted(slots, key=lambda i: slots[i].after.north)
     i = order[-1 - seed % 2]
     if stops:
@@ -88,14 +88,14 @@ class Liar:
     def sample(self, i: int, **changed: Any) -> PeerSample:
         """What vehicle i could truly say now, with something changed."""
         agent = self.ls.vehicles[i].agent
-        newest = agent.programme.newest
+        newest = agent.history.newest
         r = newest.reference(i, self.ls.now.fleet_ns)
         made = PeerSample(i, self.ls.now.fleet_ns, r.position_ned_m, r.velocity_ned_m_s, newest.revision, Phase.MOVING)
         return made._replace(**changed)
 
     def says(self, sample: PeerSample, boot_id: int = 1, digest: tuple[PeerSample, ...] = ()) -> None:
         """All hear it."""
-        newest = self.ls.vehicles[1].agent.programme.newest
+        newest = self.ls.vehicles[1].agent.history.newest
         self.sequence += 1
         message = PeerMessage(boot_id, self.sequence, newest.start_ns, newest.issuer, sample, digest)
         self.ls.inject_peer(f"fleet/{sample.vehicle_id}/state", encode_state(message), *self.ls.vehicles)
@@ -111,11 +111,11 @@ class Liar:
     def pushed_m(self) -> float:
         """The farthest that any vehicle was from its slot, by truth."""
         t = truth(self.ls, self.since_s)
-        programme = self.ls.vehicles[1].agent.programme
+        history = self.ls.vehicles[1].agent.history
         worst = 0.0
         for time_ns, row in zip(t.times_ns[::5], t.position_ned_m[::5], strict=True):
-            moment = programme.at(int(time_ns)).moment(int(time_ns))
-            slots = programme.at(int(time_ns)).slots
+            moment = history.at(int(time_ns)).state_at(int(time_ns))
+            slots = history.at(int(time_ns)).slots
             for i, p in zip(t.ids, row, strict=True):
                 worst = max(worst, float(np.linalg.norm(p - np.array(moment.slot(slots[i]).position_ned_m))))
         return worst
@@ -139,14 +139,14 @@ def drifts(liar: Liar, k: int) -> None:
     """Salami: each step is a motion that a vehicle could fly, to where vehicle 1 is, and on it."""
     p, q = liar.sample(2).position_ned_m, liar.ls.positions()[1]
     share = min(0.03 * k, 1.0)
-    liar.says(liar.sample(2, position_ned_m=between(p, q, share)))
+    liar.says(liar.sample(2, position_ned_m=lerp(p, q, share)))
 
 
 def drifts_from_ahead(liar: Liar, k: int) -> None:
     """The same, from as far in the future as is taken, so that the vehicle's own words are older."""
     ahead_ns = 900_000_000
     p, q = liar.sample(2).position_ned_m, liar.ls.positions()[1]
-    place = between(p, q, min(0.03 * k, 1.0))
+    place = lerp(p, q, min(0.03 * k, 1.0))
     liar.says(
         liar.sample(2, position_ned_m=place._replace(north=place.north + 0.9), time_ns=liar.ls.now.fleet_ns + ahead_ns)
     )

@@ -17,13 +17,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import development as dialect
 
-from companion.agent import Agent
 from companion.core.counts import OTHER
 from companion.core.frames import Ned
 from companion.core.values import Instant, PeerMessage, PeerSample, Phase
 from companion.errors import WireError
+from companion.vehicle.agent import Agent
 from companion.wire.peer import VERSION, decode_motion, decode_state, encode_motion, encode_state
-from sim.lockstep import UTC_AT_START_NS, Lockstep
+from sim.lockstep.lockstep import UTC_AT_START_NS, Lockstep
 
 pytestmark = pytest.mark.timeout(600)
 """a flight is simulated within a test, on whatever machine"""
@@ -131,7 +131,7 @@ class Noise:
     def motion(self, ls: Lockstep) -> bytes:
         """A plan with one wrong thing in it."""
         r = self.random
-        tree: Any = json.loads(encode_motion(ls.vehicles[1].agent.programme.newest))
+        tree: Any = json.loads(encode_motion(ls.vehicles[1].agent.history.newest))
         tree["revision"] += r.randrange(3)
         tree["start_ns"] = r.choice([tree["start_ns"], ls.now.fleet_ns, ls.now.fleet_ns + 3_000_000_000, 0])
         wrong: list[Any] = [nan, inf, 1e300, 1e30, 1e5, -1e3, 5e-324, 0, "x", None, [], {}, True]
@@ -251,7 +251,7 @@ def refused(noise: Noise, ls: Lockstep, i: int) -> None:
     agent.receive_peer(key, state(77), now)
     agent.receive_peer("fleet/77/state", state(77), now)
     agent.receive_peer("fleet/1/other", state(other), now)
-    newest: Any = json.loads(encode_motion(agent.programme.newest))
+    newest: Any = json.loads(encode_motion(agent.history.newest))
     for wrong in (
         {"version": 1}, {"slots": {"1": newest["slots"]["1"]}}, {"start_ns": 0}, {"shape": "star"},
         {"velocity_ned_m_s": [50, 0, 0]}, {"centre_ned_m": [nan, 0, 0]}, {"legs_start_ns": -1},
@@ -405,7 +405,7 @@ def flooded(seed: int, count: int) -> tuple[int, int, int]:
         ls.run_until((ls.now_ns + 20_000_000) * 1e-9)
         for i, v in ls.vehicles.items():
             for _ in range(8 if v.agent.flight.steers else 0):
-                one = inputs.one(v.agent.programme.newest, ls.now.fleet_ns)
+                one = inputs.one(v.agent.history.newest, ls.now.fleet_ns)
                 if one.kind in ("plan", "state"):
                     try:
                         (decode_motion if one.kind == "plan" else decode_state)(one.payload)

@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
 from companion.core.failsafe import Failsafe
-from companion.core.safety import COLLISION_DISTANCE_M
+from companion.core.safety.filter import COLLISION_DISTANCE_M
 from companion.core.values import FLYING_PHASES, Instant, Phase
-from companion.flight import ON_GROUND
+from companion.vehicle.flight import ON_GROUND
 from companion.wire.mavlink import Px4Mode
-from sim.lockstep import UTC_AT_START_NS, Lockstep
-from sim.px4.faults import Fault, FaultKind
+from sim.autopilot.faults import Fault, FaultKind
+from sim.lockstep.lockstep import UTC_AT_START_NS, Lockstep
 from sim.study.campaign import ESTIMATE_FAULTS
 
 pytestmark = pytest.mark.timeout(600)

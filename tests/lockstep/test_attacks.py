@@ -9,7 +9,7 @@ from flights import fleet
 from companion.core.frames import Ned
 from companion.core.values import PeerMessage, PeerSample, Phase
 from companion.wire.peer import decode_state, encode_motion, encode_state
-from sim.lockstep import Lockstep
+from sim.lockstep.lockstep import Lockstep
 from sim.study.attacks import PLANS, SEQUENCE_LEAP, STATES, forged_plan, forged_state
 
 NOW_NS = 1_700_000_010_000_000_000

@@ -8,8 +8,8 @@ from flights import failsafes, fleet, launch, until, until_formed, wait
 from pymavlink.dialects.v20 import development as dialect
 
 from companion.core.values import Phase
-from sim.lockstep import Lockstep
-from sim.px4.faults import Fault, FaultKind
+from sim.autopilot.faults import Fault, FaultKind
+from sim.lockstep.lockstep import Lockstep
 
 POSITION, ORIGIN, ESTIMATOR, STATUS = 32, 49, 230, 1
 AUTOPILOT: Any = dialect.MAVLink(None, srcSystem=1, srcComponent=1)
@@ -82,7 +82,7 @@ def test_an_origin_that_creeps_is_a_position_that_nobody_knows(step_m: float) ->
     for _ in range(60):
         ls.vehicles[1].autopilot.schedule.send_one(ORIGIN)
         wait(ls, 1.0)
-        if ls.phases()[1] not in (Phase.FORMED, Phase.HOLDING, Phase.APART):
+        if ls.phases()[1] not in (Phase.FORMED, Phase.HOLDING, Phase.DETACHED):
             break
     assert ls.phases()[1] in (Phase.LANDING, Phase.LANDED)
     assert ls.shift_m <= 2.0, "before the vehicle is two metres from where it believes to be"

@@ -86,7 +86,7 @@ def test_a_message_that_ends_a_companion_breaks_a_rule_and_says_where() -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(PLANS, str(drawn_faults(flight, seed)[0].magnitude), lambda plain, _: plain.no_such_field)
         record = fly(flight, seed, told.append)
-    assert record["raised"].startswith("AttributeError: 'Motion' object has no attribute 'no_such_field'")
+    assert record["raised"].startswith("AttributeError: 'FleetTrajectory' object has no attribute 'no_such_field'")
     assert any("climbing" in line for line in told)
     outcome = campaign.finish(load_config("campaign"), [record], [seed])
     assert outcome.broken == f"1 of 1 flights broke a rule, of seeds {seed}"

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from companion.errors import CompanionError
-from sim.compiled import ROOT, build
+from sim.lockstep.compiled import ROOT, build
 
 SEEDS = ("0", "1", "1001")
 

@@ -16,9 +16,9 @@ from flights import DEFAULT, READY_S, Tape, launch
 from companion.config import FleetConfig, parse, read_tables
 from companion.core.values import Instant
 from companion.io.recorder import Recorder, RecordingError, read_recording
-from companion.replay import ReplayResult, replay_file
-from sim.stubs import TRUTH_DTYPE
-from sim.summary import Flight
+from companion.io.replay import ReplayResult, replay_file
+from sim.autopilot.stubs import TRUTH_DTYPE
+from sim.launch.summary import Flight
 
 FILES = 320
 FILES_LONG = 5000

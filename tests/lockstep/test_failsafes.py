@@ -22,15 +22,15 @@ from flights import (
 )
 from pymavlink.dialects.v20 import development as dialect
 
-from companion.autopilot import AutopilotClient
 from companion.core.failsafe import FAILSAFES, LATE_S, STATUS_S, UNCERTAIN_S, Action, Failsafe
 from companion.core.frames import Ned
 from companion.core.values import Instant, PeerMessage, Phase
-from companion.flight import ON_GROUND
+from companion.vehicle.autopilot.client import AutopilotClient
+from companion.vehicle.flight import ON_GROUND
 from companion.wire.mavlink import Px4Mode, mode_parameters
 from companion.wire.peer import encode_state
-from sim.lockstep import Lockstep
-from sim.px4.faults import Fault, FaultKind
+from sim.autopilot.faults import Fault, FaultKind
+from sim.lockstep.lockstep import Lockstep
 
 pytestmark = pytest.mark.timeout(600)
 """a flight is simulated within a test, on whatever machine"""
@@ -144,7 +144,7 @@ def peer_says(s: Scene, sequence: int = 1000, revision: int | None = None, **cha
     sample, boot_id = agent.peers.sample(2), agent.peers.boot_id(2)
     assert sample is not None
     assert boot_id is not None
-    newest = agent.programme.newest
+    newest = agent.history.newest
     sample = sample._replace(**({"time_ns": s.ls.now.fleet_ns} | changed))
     if revision is not None:
         sample = sample._replace(revision=revision)
@@ -203,7 +203,7 @@ def position_jumped() -> tuple[float, float]:
     # Its new origin is not told at once.
     s.tamper(49)
     s.inject(FaultKind.ESTIMATOR_RESET)
-    must_end(s, Phase.APART, within_s=1.0)
+    must_end(s, Phase.DETACHED, within_s=1.0)
     noticed = s.noted(Failsafe.POSITION_JUMPED)
     s.tamper()
     until(s.ls, 30.0, lambda: s.phase is Phase.WAITING)
@@ -321,7 +321,7 @@ def alone() -> tuple[float, float]:
     s = scene(change=brief)
     s.begin()
     s.ls.partition({1}, {2})
-    must_end(s, Phase.APART, within_s=10.0)
+    must_end(s, Phase.DETACHED, within_s=10.0)
     s.ls.partition()
     until(s.ls, 20.0, lambda: s.ls.all_in(Phase.WAITING))
     return s.noted(Failsafe.ALONE), 4.2 + 3.0
@@ -330,7 +330,7 @@ def alone() -> tuple[float, float]:
 def alone_for_long() -> tuple[float, float]:
     s = scene(change=brief)
     s.ls.partition({1}, {2})
-    until(s.ls, 10.0, lambda: s.phase is Phase.APART)
+    until(s.ls, 10.0, lambda: s.phase is Phase.DETACHED)
     s.began_s = first(s.ls, "waiting -> apart", 1)
     must_end(s, Phase.LANDED)
     return s.noted(Failsafe.ALONE_FOR_LONG), 4.0
@@ -346,7 +346,7 @@ def apart_for_long() -> tuple[float, float]:
     s.tamper(49)
     s.inject(FaultKind.ESTIMATOR_RESET)
     must_end(s, Phase.LANDING, within_s=9.0)
-    return s.noted(Failsafe.APART_FOR_LONG), 6.1
+    return s.noted(Failsafe.DETACHED_FOR_LONG), 6.1
 
 
 def lost(s: Scene, within_s: float) -> float:
@@ -355,7 +355,7 @@ def lost(s: Scene, within_s: float) -> float:
     wait(s.ls, 0.5)
     assert "2" not in str([n.vehicle_id for n in agent._neighbours if n.in_formation])
     (n,) = (n for n in agent._neighbours if n.vehicle_id == 2)
-    assert n.other_end_ned_m is not None
+    assert n.last_seen_ned_m is not None
     assert not n.shares_avoidance
     return s.ls.now_ns * 1e-9 - s.began_s - 0.5
 
@@ -452,7 +452,7 @@ def deaf() -> tuple[float, float]:
     s = scene(4, change=brief)
     s.begin()
     s.ls.drop_topic("state")
-    until(s.ls, 9.0, lambda: all(p in (Phase.APART, Phase.LANDING) for p in s.ls.phases().values()))
+    until(s.ls, 9.0, lambda: all(p in (Phase.DETACHED, Phase.LANDING) for p in s.ls.phases().values()))
     noticed = s.noted(Failsafe.DEAF)
     s.ls.restore_topics()
     until(s.ls, 20.0, lambda: s.ls.all_in(Phase.WAITING))
@@ -559,7 +559,7 @@ SCENARIOS: dict[Failsafe, Callable[[], tuple[float, float]]] = {
     Failsafe.POSITION_JUMPS: position_jumps, Failsafe.COVARIANCE: covariance, Failsafe.HEARTBEAT: heartbeat,
     Failsafe.PILOT: pilot, Failsafe.AUTOPILOT: autopilot, Failsafe.NOT_ARMED: not_armed,
     Failsafe.NO_TAKE_OFF: no_take_off, Failsafe.ALTITUDE: altitude, Failsafe.MISSING: missing, Failsafe.ALONE: alone,
-    Failsafe.ALONE_FOR_LONG: alone_for_long, Failsafe.APART_FOR_LONG: apart_for_long, Failsafe.PEER_GONE: peer_gone,
+    Failsafe.ALONE_FOR_LONG: alone_for_long, Failsafe.DETACHED_FOR_LONG: apart_for_long, Failsafe.PEER_GONE: peer_gone,
     Failsafe.PEER_SILENT: peer_silent, Failsafe.PEER_FROZEN: peer_frozen, Failsafe.PEER_LIES: peer_lies,
     Failsafe.TWO_SOURCES: two_sources, Failsafe.OWN_ID: own_id, Failsafe.DEAF: deaf,
     Failsafe.PEER_CLOCK: peer_clock, Failsafe.BATTERY_LOW: battery_low, Failsafe.BATTERY_CRITICAL: battery_critical,
@@ -587,10 +587,10 @@ def test_actions_are_what_the_scenarios_check() -> None:
     landing = {f for f, row in FAILSAFES.items() if row.action is Action.LAND}
     assert landing == {
         Failsafe.POSITION_JUMPS, Failsafe.COVARIANCE, Failsafe.NO_TAKE_OFF, Failsafe.ALTITUDE, Failsafe.MISSING,
-        Failsafe.ALONE_FOR_LONG, Failsafe.APART_FOR_LONG, Failsafe.BATTERY_CRITICAL, Failsafe.STOPPED,
+        Failsafe.ALONE_FOR_LONG, Failsafe.DETACHED_FOR_LONG, Failsafe.BATTERY_CRITICAL, Failsafe.STOPPED,
     }  # fmt: skip
     assert {f for f, row in FAILSAFES.items() if row.action is Action.RETURN} == {Failsafe.BATTERY_LOW}
-    assert {f for f, row in FAILSAFES.items() if row.action is Action.HOLD} == {
+    assert {f for f, row in FAILSAFES.items() if row.action is Action.LEAVE_FORMATION} == {
         Failsafe.POSITION_JUMPED, Failsafe.ALONE, Failsafe.DEAF,
     }  # fmt: skip
 

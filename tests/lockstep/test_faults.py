@@ -27,16 +27,16 @@ from flights import (
 
 from companion.config import FleetConfig
 from companion.core.frames import Ned
-from companion.core.plan import VelocityLeg, with_legs
+from companion.core.trajectory import VelocityLeg, with_legs
 from companion.core.values import Instant, Phase
 from companion.errors import RefusedError
-from companion.operate import Operator, turn_leg, velocity_leg
+from companion.operator.client import Operator, turn_leg, velocity_leg
 from companion.wire.mavlink import Px4Mode
 from companion.wire.peer import encode_motion
-from sim.broken_law import BrokenLaw
-from sim.lockstep import Lockstep
-from sim.network import NetworkParameters
-from sim.px4.faults import Fault, FaultKind
+from sim.autopilot.faults import Fault, FaultKind
+from sim.lockstep.lockstep import Lockstep
+from sim.lockstep.network import NetworkParameters
+from sim.study.broken_law import BrokenLaw
 
 pytestmark = pytest.mark.timeout(600)
 """a flight is simulated within a test, on whatever machine"""
@@ -46,12 +46,12 @@ CLEARANCE_M = 1.2
 
 def leader(ls: Lockstep) -> int:
     """The vehicle in the foremost slot: the others fly over its place."""
-    slots = ls.vehicles[1].agent.programme.newest.slots
+    slots = ls.vehicles[1].agent.history.newest.slots
     return max(slots, key=lambda i: slots[i].after.north)
 
 
 def held(ls: Lockstep) -> set[bytes]:
-    return {encode_motion(v.agent.programme.newest) for v in ls.vehicles.values() if v.alive}
+    return {encode_motion(v.agent.history.newest) for v in ls.vehicles.values() if v.alive}
 
 
 # -- a companion is killed -------------------------------------------------------------------------------------------
@@ -135,10 +135,10 @@ def test_a_companion_that_starts_anew_is_told_the_plan_and_disturbs_nobody(kille
     ls = killed.ls
     ls.restart(killed.killed)
     agent = ls.vehicles[killed.killed].agent
-    assert agent.programme.newest.revision == 0
+    assert agent.history.newest.revision == 0
     wait(ls, 3.0)
     assert len(held(ls)) == 1
-    assert agent.programme.newest.revision > 1
+    assert agent.history.newest.revision > 1
     assert agent.phase is Phase.IDLE
     assert all(ls.vehicles[i].agent.peers.phases()[killed.killed] is Phase.IDLE for i in killed.others)
 
@@ -226,7 +226,7 @@ class BadNetwork:
         self.ls = ls = launch(self.config, seed=5, network=NetworkParameters(delay_s=0.1, jitter_s=0.02, loss=0.3))
         until_formed(ls)
         # Two operators at once, each heard by one vehicle.
-        now = ls.vehicles[1].agent.programme.newest
+        now = ls.vehicles[1].agent.history.newest
         self.orders = []
         for k, i in enumerate((1, 4)):
             leg = VelocityLeg(Ned(1.0, 0.1 * k, 0.0), 0.0)
@@ -235,7 +235,7 @@ class BadNetwork:
             command = json.dumps({"verb": "motion", "motion": json.loads(encode_motion(motion))}).encode()
             assert json.loads(ls.command(command, i)[i])["accepted"]
         wait(ls, 3.0)
-        self.agreed = {v.agent.programme.newest.order for v in ls.vehicles.values()}
+        self.agreed = {v.agent.history.newest.order for v in ls.vehicles.values()}
         wait(ls, 5.0)
         self.cut_s = ls.now_ns * 1e-9
         ls.partition({1, 2}, {3, 4})
@@ -350,7 +350,7 @@ def test_a_motion_faster_than_the_limits_is_refused_by_every_vehicle(operated: O
     ls = operated.ls
     with pytest.raises(RefusedError, match=r"its leg 0 flies at 5.00 m/s, may 3 m/s"):
         operated.operator.move(velocity_leg(5.0, 0.0, 0.0), ls.now.fleet_ns)
-    newest = ls.vehicles[1].agent.programme.newest
+    newest = ls.vehicles[1].agent.history.newest
     fast = with_legs(newest, at_ns=ls.now.fleet_ns + 10**9, issuer=0, legs=(velocity_leg(5.0, 0.0, 0.0),))
     command = json.dumps({"verb": "motion", "revision": 99, "issuer": "x", "motion": json.loads(encode_motion(fast))})
     for answer in ls.command(command.encode()).values():
@@ -419,7 +419,7 @@ def test_positions_frozen_at_the_climbs_end_make_nobody_believe_in_a_pilot(altit
     assert ls.phases()[1] is Phase.CLIMBING
     ls.vehicles[1].autopilot.inject(Fault(FaultKind.POSITION_FROZEN, duration_s=seconds))
     until(ls, 5.0, lambda: ls.phases()[1] is not Phase.CLIMBING)
-    assert ls.phases()[1] in (Phase.WAITING, Phase.APART)
+    assert ls.phases()[1] in (Phase.WAITING, Phase.DETACHED)
     assert not any("OFFBOARD left" in note for _, note in failsafes(ls))
 
 
@@ -432,9 +432,9 @@ def test_the_plan_begins_although_a_slot_cannot_be_reached(stopped: tuple[int, .
     for i in stopped:
         agent = ls.vehicles[i].agent
         agent.law = BrokenLaw(agent.law, Ned(0.0, 0.0, 0.0))
-    until(ls, 20.0, lambda: any(v.agent.programme.newest.revision == 1 for v in ls.vehicles.values()))
-    formed = ls.vehicles[1].agent.programme.newest
-    until(ls, 40.0, lambda: any(v.agent.programme.newest.legs for v in ls.vehicles.values()))
+    until(ls, 20.0, lambda: any(v.agent.history.newest.revision == 1 for v in ls.vehicles.values()))
+    formed = ls.vehicles[1].agent.history.newest
+    until(ls, 40.0, lambda: any(v.agent.history.newest.legs for v in ls.vehicles.values()))
     assert ls.now.fleet_ns > formed.blend_end_ns + 6_000_000_000
     assert all(ls.phases()[i] is Phase.FORMING for i in stopped)
     until_landed(ls)
@@ -467,22 +467,22 @@ def test_a_return_for_a_low_battery_outlives_a_motion_that_was_asked_for_at_the_
     until_formed(ls)
     until(ls, 20.0, lambda: ls.all_in(Phase.MOVING))
     agent = ls.vehicles[2].agent
-    before = agent.programme.newest
+    before = agent.history.newest
     ls.vehicles[2].autopilot.inject(Fault(FaultKind.LOW_BATTERY, 0.2))
-    until(ls, 20.0, lambda: agent.programme.newest.returns)
-    returning = agent.programme.newest
+    until(ls, 20.0, lambda: agent.history.newest.returns)
+    returning = agent.history.newest
     asked = with_legs(before, at_ns=returning.start_ns - 10**9, issuer=0, legs=(VelocityLeg(Ned(1.0, 0.0, 0.0), 0.0),))
     assert asked.revision == returning.revision
     command = json.dumps({"verb": "motion", "motion": json.loads(encode_motion(asked))}).encode()
     assert all(json.loads(a)["accepted"] for a in ls.command(command).values())
-    until(ls, 10.0, lambda: agent.programme.newest.returns and agent.programme.newest.revision > returning.revision)
+    until(ls, 10.0, lambda: agent.history.newest.returns and agent.history.newest.revision > returning.revision)
     # What is asked for afterwards, and so in its knowledge, is flown.
-    newest = agent.programme.newest
+    newest = agent.history.newest
     later = with_legs(newest, at_ns=ls.now.fleet_ns + 10**9, issuer=0, legs=(VelocityLeg(Ned(0.5, 0.0, 0.0), 0.0),))
     command = json.dumps({"verb": "motion", "motion": json.loads(encode_motion(later))}).encode()
     assert all(json.loads(a)["accepted"] for a in ls.command(command).values())
     wait(ls, 8.0)
-    assert agent.programme.newest.order == later.order
+    assert agent.history.newest.order == later.order
 
 
 def test_a_vehicle_whose_way_back_would_leave_the_fence_lands_and_the_others_stay() -> None:

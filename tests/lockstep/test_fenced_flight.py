@@ -8,12 +8,12 @@ import pytest
 from flights import fleet, launch, truth, until, until_formed, wait
 
 from companion.core.frames import Ned
-from companion.core.plan import GotoLeg, Motion, VelocityLeg, with_legs
+from companion.core.trajectory import FleetTrajectory, GotoLeg, VelocityLeg, with_legs
 from companion.core.values import ZERO, Phase
 from companion.wire.peer import encode_motion
-from sim.broken_law import BrokenLaw
-from sim.lockstep import Lockstep
-from sim.network import NetworkParameters
+from sim.lockstep.lockstep import Lockstep
+from sim.lockstep.network import NetworkParameters
+from sim.study.broken_law import BrokenLaw
 
 RADIUS_M = 30.0
 CEILING_M = 8.0
@@ -29,16 +29,16 @@ def fenced(count: int, *, fence: bool = True, lag_s: float = 0.15, automatic: bo
     return launch(fleet(count, change=change), network=NetworkParameters(delay_s=0.1))
 
 
-def send(ls: Lockstep, motion: Motion) -> list[dict[str, Any]]:
+def send(ls: Lockstep, motion: FleetTrajectory) -> list[dict[str, Any]]:
     command = json.dumps({"verb": "motion", "motion": json.loads(encode_motion(motion))}).encode()
     return [json.loads(a) for a in ls.command(command).values()]
 
 
-def newest(ls: Lockstep) -> Motion:
-    return ls.vehicles[1].agent.programme.newest
+def newest(ls: Lockstep) -> FleetTrajectory:
+    return ls.vehicles[1].agent.history.newest
 
 
-def moved(ls: Lockstep, leg: VelocityLeg | GotoLeg) -> Motion:
+def moved(ls: Lockstep, leg: VelocityLeg | GotoLeg) -> FleetTrajectory:
     return with_legs(newest(ls), at_ns=ls.now.fleet_ns + 10**9, issuer=0, legs=(leg,))
 
 
@@ -84,7 +84,7 @@ def test_a_move_for_ever_ends_at_the_fence_one_up_is_refused_and_a_hold_never_is
     wait(ls, 40.0)
     t = truth(ls, start_s)
     assert float(np.hypot(t.position_ned_m[..., 0], t.position_ned_m[..., 1]).max()) < RADIUS_M
-    assert newest(ls).moment(ls.now.fleet_ns).centre.position.north > RADIUS_M + 10.0
+    assert newest(ls).state_at(ls.now.fleet_ns).centre.position.north > RADIUS_M + 10.0
     assert ls.vehicles[1].agent.status(ls.now)["limited"]["fence"] > 100
     assert all(a["accepted"] for a in send(ls, moved(ls, VelocityLeg(ZERO, 0.0))))
     assert all(a["accepted"] for a in send(ls, moved(ls, GotoLeg(Ned(0.0, 0.0, -3.0), 60.0))))

@@ -23,14 +23,14 @@ from flights import (
     until_landed,
 )
 
-from companion.agent import Agent
 from companion.config import FleetConfig
 from companion.core.values import Instant, Phase
-from companion.replay import replay
+from companion.io.replay import replay
+from companion.vehicle.agent import Agent
 from companion.wire.peer import decode_motion, encode_motion
-from sim.lockstep import UTC_AT_START_NS, Lockstep
-from sim.network import NetworkParameters
-from sim.summary import Flight, Put, summarise
+from sim.launch.summary import Flight, Put, summarise
+from sim.lockstep.lockstep import UTC_AT_START_NS, Lockstep
+from sim.lockstep.network import NetworkParameters
 
 pytestmark = pytest.mark.timeout(600)
 """a flight is simulated within a test, on whatever machine"""
@@ -112,9 +112,9 @@ def test_vehicles_say_a_hundredth_of_what_twenty_states_a_second_would(ten: Reco
 
 
 def test_all_fly_the_same_motions(ten: Recorded) -> None:
-    motions = {encode_motion(v.agent.programme.newest) for v in ten.ls.vehicles.values()}
+    motions = {encode_motion(v.agent.history.newest) for v in ten.ls.vehicles.values()}
     assert len(motions) == 1
-    orders = {tuple(m.order for m in v.agent.programme.motions) for v in ten.ls.vehicles.values()}
+    orders = {tuple(m.order for m in v.agent.history.motions) for v in ten.ls.vehicles.values()}
     assert len(orders) == 1
 
 
@@ -190,4 +190,4 @@ def test_motions_told_on_the_network_are_those_that_were_flown(ten: Recorded) ->
         if e.channel == "input/peer" and b"/plan\0" in e.body[:24]
     ]
     newest = max(told, key=lambda m: m.order)
-    assert newest.order <= ten.ls.vehicles[REPLAYED].agent.programme.newest.order
+    assert newest.order <= ten.ls.vehicles[REPLAYED].agent.history.newest.order

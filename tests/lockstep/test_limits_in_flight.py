@@ -11,12 +11,12 @@ import pytest
 from flights import fleet, parse, until, wait
 
 from companion.core.frames import Ned
-from companion.core.law import Law
-from companion.core.plan import Reference
-from companion.core.safety import SafetyFilter
+from companion.core.law.starling import Law
+from companion.core.safety.filter import SafetyFilter
+from companion.core.trajectory import Reference
 from companion.core.values import FILTERED_PHASES, Command, Instant, Neighbour, Phase, VehicleState
-from sim.lockstep import Lockstep
-from sim.px4.faults import Fault, FaultKind
+from sim.autopilot.faults import Fault, FaultKind
+from sim.lockstep.lockstep import Lockstep
 
 SPEED_M_S, ACCELERATION_M_S2, CLIMB_M_S, DESCENT_M_S = 6.0, 5.0, 1.5, 1.0
 FLOOR_M, CEILING_M, MARGIN_M = 2.0, 8.0, 0.5

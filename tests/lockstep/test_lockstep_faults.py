@@ -4,7 +4,7 @@ import pytest
 from flights import fleet, launch, until, wait
 
 from companion.core.values import Phase
-from sim.lockstep import Lockstep
+from sim.lockstep.lockstep import Lockstep
 
 pytestmark = pytest.mark.timeout(600)
 """a flight is simulated within a test, on whatever machine"""

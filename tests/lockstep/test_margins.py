@@ -3,7 +3,7 @@
 import numpy as np
 from flights import errors, failsafes, fleet, straight, truth, until_formed, wait
 
-from sim.lockstep import Lockstep
+from sim.lockstep.lockstep import Lockstep
 
 SLOW_S = 0.060
 

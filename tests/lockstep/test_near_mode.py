@@ -6,13 +6,13 @@ from collections.abc import Iterable
 import pytest
 from flights import fleet, launch, until, wait
 
-from companion.agent import CAUSES
 from companion.config import FleetConfig
 from companion.core.near import NearMode
-from companion.core.safety import COLLISION_DISTANCE_M
+from companion.core.safety.filter import COLLISION_DISTANCE_M
 from companion.core.values import Phase
-from sim.lockstep import Lockstep
-from sim.network import NetworkParameters
+from companion.vehicle.agent import CAUSES
+from sim.lockstep.lockstep import Lockstep
+from sim.lockstep.network import NetworkParameters
 from sim.study import headon, messages
 from sim.study.common import load_config
 

@@ -22,14 +22,14 @@ from flights import (
     wait,
 )
 
-from companion.agent import Agent
-from companion.core.plan import VelocityLeg, with_legs
+from companion.core.trajectory import VelocityLeg, with_legs
 from companion.core.values import ZERO, Instant, Phase
-from companion.operate import Operator, velocity_leg
-from companion.orders import Place
+from companion.operator.client import Operator, velocity_leg
+from companion.vehicle.agent import Agent
+from companion.vehicle.orders import Place
 from companion.wire.mavlink import Px4Mode
 from companion.wire.peer import encode_motion
-from sim.lockstep import Lockstep
+from sim.lockstep.lockstep import Lockstep
 
 pytestmark = pytest.mark.timeout(600)
 """a flight is simulated within a test, on whatever machine"""
@@ -230,7 +230,7 @@ def test_a_fleet_of_twenty_thousand_commands_and_motions_and_a_late_companion_ob
     for _ in range(20):
         for i in ls.vehicles:
             ls.command(b'{"verb":"resume"}', i)
-    newest = ls.vehicles[1].agent.programme.newest
+    newest = ls.vehicles[1].agent.history.newest
     for revision in (10_000, 20_000):
         motion = with_legs(newest, at_ns=ls.now.fleet_ns, issuer=0, legs=(VelocityLeg(ZERO, 0.0),))
         payload = json.dumps(
@@ -241,16 +241,16 @@ def test_a_fleet_of_twenty_thousand_commands_and_motions_and_a_late_companion_ob
     ls.kill(2)
     wait(ls, 1.0)
     ls.restart(2)
-    until(ls, 10.0, lambda: ls.vehicles[2].agent.programme.newest.revision == 20_000)
+    until(ls, 10.0, lambda: ls.vehicles[2].agent.history.newest.revision == 20_000)
     assert operator.move(velocity_leg(0.3, 0.0, 0.0), ls.now.fleet_ns).all_accepted
-    assert {v.agent.programme.newest.revision for v in ls.vehicles.values()} == {20_001}
+    assert {v.agent.history.newest.revision for v in ls.vehicles.values()} == {20_001}
     assert operator.release().all_accepted
 
 
 def test_a_fresh_fleet_takes_no_motion_far_ahead_of_what_its_peers_tell() -> None:
     ls = Lockstep(fleet(3, change=wait_for_orders))
     ls.run_until(6.0)
-    newest = ls.vehicles[1].agent.programme.newest
+    newest = ls.vehicles[1].agent.history.newest
     motion = replace(with_legs(newest, at_ns=ls.now.fleet_ns, issuer=0, legs=()), revision=2**32 - 1)
     payload = json.dumps({"verb": "motion", "motion": json.loads(encode_motion(motion))}).encode()
     for answer in ls.command(payload).values():
@@ -266,7 +266,7 @@ def test_a_hold_that_builds_on_an_old_motion_is_built_once_more_on_the_newest() 
     wait(ls, 1.0)
     assert Operator(ls.config, link).hold(lambda: ls.now.fleet_ns).all_accepted
     for v in ls.vehicles.values():
-        newest = v.agent.programme.newest
+        newest = v.agent.history.newest
         assert (newest.revision, newest.shape, newest.climb_at_end_m_s) == (3, "line", 0.0)
 
 
@@ -299,7 +299,7 @@ def test_of_the_places_given_one_must_be_this_companions() -> None:
 
 def test_no_motion_may_use_up_the_revisions_of_all_others() -> None:
     ls, _ = aloft(1)
-    newest = ls.vehicles[1].agent.programme.newest
+    newest = ls.vehicles[1].agent.history.newest
     legs = (VelocityLeg(ZERO, 0.0),)
     motion = with_legs(newest, at_ns=ls.now.fleet_ns, issuer=0, legs=legs)
     tree = json.loads(encode_motion(motion))
@@ -310,7 +310,7 @@ def test_no_motion_may_use_up_the_revisions_of_all_others() -> None:
 
 def test_a_motion_that_climbs_for_ever_or_begins_far_away_is_refused() -> None:
     ls, _ = aloft(1)
-    newest = ls.vehicles[1].agent.programme.newest
+    newest = ls.vehicles[1].agent.history.newest
     up = with_legs(newest, at_ns=ls.now.fleet_ns, issuer=0, legs=(velocity_leg(0.0, 0.0, 0.5),))
     answer = said(ls, order("motion", "a", place(ls), motion=json.loads(encode_motion(up))))
     assert answer["reason"] == "it climbs or sinks for ever; give an altitude to go to"
@@ -392,7 +392,7 @@ def test_a_released_vehicle_hovers_without_setpoints_and_comes_back_on_command_w
     resumed_s = ls.now_ns * 1e-9
     assert operator.resume(1).all_accepted
     wait(ls, 2.0)
-    assert ls.phases()[1] is Phase.APART
+    assert ls.phases()[1] is Phase.DETACHED
     until(ls, 60.0, lambda: ls.phases()[1] is Phase.MOVING)
     t = truth(ls, released_s)
     assert distances(t).min() >= 1.2
@@ -481,7 +481,7 @@ def test_what_is_being_killed_is_not_resumed_and_a_kill_in_vain_does_not_fire_la
     assert operator.resume().all_accepted
     wait(ls, 5.0)
     assert ls.vehicles[1].autopilot.truth().armed
-    assert ls.phases()[1] in (Phase.APART, Phase.WAITING)
+    assert ls.phases()[1] in (Phase.DETACHED, Phase.WAITING)
 
 
 def test_on_the_ground_there_is_nothing_to_resume() -> None:

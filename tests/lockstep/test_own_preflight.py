@@ -8,8 +8,8 @@ from flights import fleet, launch, parse, set_parameter, until, until_formed, wa
 
 from companion.core.values import Instant, Phase
 from companion.wire.mavlink import Px4Mode
-from sim.lockstep import Lockstep
-from sim.px4.faults import Fault, FaultKind
+from sim.autopilot.faults import Fault, FaultKind
+from sim.lockstep.lockstep import Lockstep
 
 SETPOINT, COMMAND, PARAMETER_READ, TIMESYNC, HEARTBEAT = 84, 76, 20, 111, 0
 STREAM_RATES, REQUEST_MESSAGE = 511, 512
@@ -140,7 +140,7 @@ def test_a_companion_that_starts_while_its_vehicle_flies_sends_nothing_that_move
     assert {m.command for m in sent if m.get_msgId() == COMMAND} <= {STREAM_RATES, REQUEST_MESSAGE}
     assert "armed by somebody else" in agent.unready(ls.now)
     assert "armed by somebody else" in (take_off(ls, 1) or "")
-    assert "armed by somebody else" in {c.says for c in agent.checks(ls.now) if not c.met}
+    assert "armed by somebody else" in {c.message for c in agent.checks(ls.now) if not c.passed}
     # In OFFBOARD the autopilot's own failsafe has landed it by its parameter; AUTO.TAKEOFF goes on without us.
     wanted = {"formed": {Px4Mode.AUTO_LAND}, "climbing": {Px4Mode.AUTO_TAKEOFF, Px4Mode.AUTO_LOITER}}[when]
     assert ls.vehicles[1].autopilot.truth().custom_mode in wanted
@@ -155,5 +155,5 @@ def test_accounts_of_a_lockstep_fleet_are_of_one_mind() -> None:
     accounts = [v.agent.account(ls.now) for v in ls.vehicles.values()]
     assert len({a.configuration for a in accounts}) == 1
     assert len({a.assignment for a in accounts}) == 1
-    assert all(c.met for a in accounts for c in a.checks)
+    assert all(c.passed for a in accounts for c in a.checks)
     assert all(a.position_ned_m is not None and a.origin_ned_m is not None for a in accounts)

@@ -71,10 +71,10 @@ def test_over_twenty_seeds_nobody_comes_near_when_all_states_are_lost_in_a_turn(
 def test_one_that_alone_hears_nobody_stands_apart_and_comes_back() -> None:
     ls = moving(4, "v", 4, STRAIGHT, t_max_s=3.0)
     ls.drop_topic("state", 2)
-    until(ls, 14.0, lambda: ls.phases()[2] is Phase.APART)
+    until(ls, 14.0, lambda: ls.phases()[2] is Phase.DETACHED)
     wait(ls, 1.0)
     assert {p for i, p in ls.phases().items() if i != 2} == {Phase.MOVING}
-    assert all(ls.vehicles[i].agent.peers.phases()[2] is Phase.APART for i in (1, 3, 4))
+    assert all(ls.vehicles[i].agent.peers.phases()[2] is Phase.DETACHED for i in (1, 3, 4))
     ls.restore_topics()
     until(ls, 40.0, lambda: ls.phases()[2] in FORMATION_PHASES)
 

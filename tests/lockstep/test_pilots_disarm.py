@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import development as dialect
 
 from companion.core.values import Instant, Phase
 from companion.wire.mavlink import FORCE, Px4Mode
-from sim.lockstep import Lockstep
+from sim.lockstep.lockstep import Lockstep
 
 GROUND_STATION: Any = dialect.MAVLink(None, srcSystem=255, srcComponent=190)
 ARM, ACK = 400, 77

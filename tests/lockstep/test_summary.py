@@ -14,13 +14,13 @@ from flights import Tape, fleet, launch, straight, until, until_formed, until_la
 
 from companion.config import FleetConfig
 from companion.core.frames import Ned
-from companion.core.plan import Motion, Programme, VelocityLeg, with_legs
+from companion.core.trajectory import FleetTrajectory, TrajectoryHistory, VelocityLeg, with_legs
 from companion.core.values import Phase
 from companion.wire.mavlink import Px4Mode
 from companion.wire.peer import encode_motion
-from sim.lockstep import UTC_AT_START_NS, Lockstep
-from sim.px4.faults import Fault, FaultKind
-from sim.summary import Flight, summarise
+from sim.autopilot.faults import Fault, FaultKind
+from sim.launch.summary import Flight, summarise
+from sim.lockstep.lockstep import UTC_AT_START_NS, Lockstep
 
 ON_GROUND = 1
 COUNT = 3
@@ -109,7 +109,7 @@ def minimum_distance_m(rows: Any, takeoff_ns: int) -> tuple[float, float] | None
     return min(found, default=None)
 
 
-def formation_error_m(f: Flown, programme: Programme) -> float | None:
+def formation_error_m(f: Flown, history: TrajectoryHistory) -> float | None:
     """RMS distance from the slots about the common centre, while all that stay are formed, steered and in the air."""
     staying = [i for i, v in f.ls.vehicles.items() if v.alive]
 
@@ -121,7 +121,7 @@ def formation_error_m(f: Flown, programme: Programme) -> float | None:
     formed_ns = max(when(i, "-> formed")[0] for i in staying)
     ends = ("-> landing", "-> returning", "-> released", "-> landed")
     left_ns = min((t for i in staying for t in when(i, *ends) if t > formed_ns), default=1 << 63)
-    changes = [m for m in programme.motions[1:] if m.blend_start_ns == m.start_ns]
+    changes = [m for m in history.motions[1:] if m.blend_start_ns == m.start_ns]
     squares = []
     for t, state in at_times(f.rows).items():
         flying = all(
@@ -132,17 +132,17 @@ def formation_error_m(f: Flown, programme: Programme) -> float | None:
             continue
         if any(m.start_ns <= t <= m.blend_end_ns + 3e9 for m in changes):
             continue
-        slots = [programme.reference(i, t).position_ned_m for i in staying]
+        slots = [history.reference(i, t).position_ned_m for i in staying]
         e = np.array([state[i].place for i in staying]) - np.array(slots)
         squares += [float(x) for x in ((e - e.mean(axis=0)) ** 2).sum(axis=1)]
     return sqrt(sum(squares) / len(squares)) if squares else None
 
 
-def check(f: Flown, programme: Programme | None = None) -> dict[str, Any]:
+def check(f: Flown, history: TrajectoryHistory | None = None) -> dict[str, Any]:
     """The summary, once its figures are those of the definitions."""
     summary = f.summary()
     alive = next(i for i, v in f.ls.vehicles.items() if v.alive and i not in f.dead)
-    wanted = formation_error_m(f, programme or f.ls.vehicles[alive].agent.programme)
+    wanted = formation_error_m(f, history or f.ls.vehicles[alive].agent.history)
     assert summary["steady"]["formation_error_rms_m"] == (None if wanted is None else pytest.approx(wanted, abs=6e-5))
     nearest = minimum_distance_m(f.rows, f.takeoff_ns)
     told = (summary["minimum_distance_m"], summary["minimum_distance_at_s"])
@@ -171,7 +171,7 @@ def test_a_plain_flight_passes_with_the_figures_of_the_definitions() -> None:
     assert (command["verb"], command["issuer"], command["accepted"]) == ("takeoff", "lockstep", [1, 2, 3])
 
 
-def command(ls: Lockstep, motion: Motion) -> list[bool]:
+def command(ls: Lockstep, motion: FleetTrajectory) -> list[bool]:
     payload = json.dumps({"verb": "motion", "motion": json.loads(encode_motion(motion))}).encode()
     return [json.loads(a)["accepted"] for a in ls.command(payload).values()]
 
@@ -182,9 +182,9 @@ def test_a_refused_motion_of_the_same_revision_shape_and_issuer_as_a_flown_one_i
 ) -> None:
     f = flown(fleet(COUNT, legs=straight(600.0)))
     until(f.ls, 60.0, lambda: f.ls.all_in(Phase.MOVING))
-    newest = f.ls.vehicles[1].agent.programme.newest
+    newest = f.ls.vehicles[1].agent.history.newest
 
-    def motion(north_m_s: float, ahead_s: float) -> Motion:
+    def motion(north_m_s: float, ahead_s: float) -> FleetTrajectory:
         start_ns = f.ls.now.fleet_ns + round(ahead_s * 1e9)
         return with_legs(newest, at_ns=start_ns, issuer=0, legs=(VelocityLeg(Ned(north_m_s, 0.0, 0.0), 0.0),))
 
@@ -214,7 +214,7 @@ def test_a_refused_motion_of_the_same_revision_shape_and_issuer_as_a_flown_one_i
 def test_a_motion_that_one_vehicle_alone_adopted_is_not_the_formations() -> None:
     f = flown(fleet(COUNT, legs=straight(600.0)))
     until(f.ls, 60.0, lambda: f.ls.all_in(Phase.MOVING))
-    before = f.ls.vehicles[1].agent.programme.newest
+    before = f.ls.vehicles[1].agent.history.newest
     wait(f.ls, 5.0)
     f.ls.partition([1, 2], [3])
     motion = with_legs(
@@ -225,7 +225,7 @@ def test_a_motion_that_one_vehicle_alone_adopted_is_not_the_formations() -> None
     wait(f.ls, 8.0)
     f.ls.command(b'{"verb":"land"}')
     until_landed(f.ls)
-    summary = check(f, f.ls.vehicles[1].agent.programme)
+    summary = check(f, f.ls.vehicles[1].agent.history)
     assert summary["passed"] is False
     assert summary["commands"][1]["accepted"] == [3]
 

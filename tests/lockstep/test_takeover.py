@@ -9,8 +9,8 @@ from pymavlink.dialects.v20 import development as dialect
 
 from companion.core.values import Instant, Phase
 from companion.wire.mavlink import Px4Mode, arm_parameters, mode_parameters, takeoff_parameters
-from sim.lockstep import Lockstep
-from sim.px4.faults import Fault, FaultKind
+from sim.autopilot.faults import Fault, FaultKind
+from sim.lockstep.lockstep import Lockstep
 
 GROUND_STATION: Any = dialect.MAVLink(None, srcSystem=255, srcComponent=190)
 

@@ -18,7 +18,7 @@ from flights import (
 
 from companion.config import FleetConfig, load
 from companion.core.values import Phase
-from companion.operate import Operator
+from companion.operator.client import Operator
 
 SETTLED_WITHIN_S = 60.0
 CLEARANCE_M = 0.75

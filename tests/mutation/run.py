@@ -27,8 +27,8 @@ ROOT = Path(__file__).resolve().parents[2]
 EXPLAINED = Path(__file__).with_name("survivors.toml")
 _PROGRAM, _SAFETY, _FENCE = (f"tests/unit/test_{x}.py" for x in ("program", "safety", "fence"))
 SOURCES = {
-    "companion/core/safety.py": (_SAFETY, _FENCE, _PROGRAM),
-    "companion/core/program.py": (_PROGRAM, _SAFETY, _FENCE),
+    "companion/core/safety/filter.py": (_SAFETY, _FENCE, _PROGRAM),
+    "companion/core/safety/program.py": (_PROGRAM, _SAFETY, _FENCE),
     "companion/core/phase.py": ("tests/unit/test_phase.py",),
 }
 """what is changed, and the tests of which one must fail then, the likeliest first"""

@@ -5,8 +5,8 @@ import sys
 from pathlib import Path
 
 from companion.core.frames import Geodetic, Ned
-from sim.px4.parameters import defaults
-from sim.stubs import StubFleetSettings, StubVehicleSettings, run_stubs
+from sim.autopilot.parameters import defaults
+from sim.autopilot.stubs import StubFleetSettings, StubVehicleSettings, run_stubs
 
 ROOT = Path(__file__).resolve().parents[2]
 HERE = Path(__file__).resolve().parent

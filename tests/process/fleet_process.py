@@ -24,8 +24,8 @@ import tomli_w
 from companion.config import FleetConfig, load
 from companion.io.loop import network_settings
 from companion.io.zenoh_peers import OperatorLink, scouting_port
-from companion.operate import Operator
-from sim.stubs import TRUTH_DTYPE
+from companion.operator.client import Operator
+from sim.autopilot.stubs import TRUTH_DTYPE
 
 PORTS = range(26_000, 32_000, 100)
 """clear of PX4's, of the fleets' scouting and of the ephemeral ones"""

@@ -13,7 +13,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 from companion.core.frames import Geodetic, Ned
-from sim.stubs import StubFleetSettings, StubVehicleSettings, run_stubs
+from sim.autopilot.stubs import StubFleetSettings, StubVehicleSettings, run_stubs
 
 QUICK = (
     ("COM_SPOOLUP_TIME", 0.2),
@@ -105,7 +105,10 @@ def listening(port: int) -> Iterator[socket.socket]:
 @contextmanager
 def launched(settings: StubFleetSettings) -> Iterator[subprocess.Popen[bytes]]:
     """The stubs as a launcher's child, whose standard input is the pipe to it."""
-    code = "import pickle, sys; from sim.stubs import run_stubs; run_stubs(pickle.loads(bytes.fromhex(sys.argv[1])))"
+    code = (
+        "import pickle, sys; from sim.autopilot.stubs import run_stubs; "
+        "run_stubs(pickle.loads(bytes.fromhex(sys.argv[1])))"
+    )
     settings = dataclasses.replace(settings, stop_fd=0)
     process = subprocess.Popen([sys.executable, "-c", code, pickle.dumps(settings).hex()], stdin=subprocess.PIPE)
     try:

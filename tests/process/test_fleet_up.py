@@ -51,6 +51,7 @@ from companion.core.failsafe import Failsafe
 from companion.core.frames import Ned
 from companion.core.values import PeerMessage, PeerSample, Phase
 from companion.io.recorder import read_recording
+from companion.io.replay import replay_file
 from companion.io.zenoh_peers import (
     PLANS_HZ,
     REQUESTS_HZ,
@@ -58,8 +59,7 @@ from companion.io.zenoh_peers import (
     scouting_port,
     zenoh_configuration,
 )
-from companion.operate import Operator
-from companion.replay import replay_file
+from companion.operator.client import Operator
 from companion.wire.mavlink import Px4Mode, dialect
 from companion.wire.peer import encode_state
 from sim.__main__ import main as fleet_main

@@ -20,15 +20,15 @@ from fleet_process import SETTLED, Fleet, all_in, eventually, flight_folder, mak
 from fleet_process import wait_status as wait_for
 from fuzz_inputs import Inputs
 
-from companion.core.plan import Motion
+from companion.core.trajectory import FleetTrajectory
 from companion.io.loop import TICK_RECORD, network_settings
 from companion.io.recorder import read_recording
+from companion.io.replay import replay_file
 from companion.io.zenoh_peers import zenoh_configuration
-from companion.operate import Operator
-from companion.replay import replay_file
+from companion.operator.client import Operator
 from companion.wire.mavlink import Px4Mode
 from companion.wire.peer import decode_motion
-from sim.reference_loop import read_reference_loop
+from sim.launch.reference_loop import read_reference_loop
 
 pytestmark = [pytest.mark.process, pytest.mark.long, pytest.mark.timeout(900)]
 
@@ -56,7 +56,7 @@ class Seen:
     rejected: dict[str, int]
 
 
-def newest_of(operator: Operator) -> Motion:
+def newest_of(operator: Operator) -> FleetTrajectory:
     motions = [decode_motion(json.dumps(s["motion"]).encode()) for s in operator.status().values() if s is not None]
     return max(motions, key=lambda m: m.order)
 

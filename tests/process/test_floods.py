@@ -18,7 +18,7 @@ from zenoh.handlers import Callback
 from companion.io.loop import TICK_RECORD
 from companion.io.recorder import read_recording
 from companion.io.zenoh_peers import PeerNetworkSettings, zenoh_configuration
-from sim.reference_loop import read_reference_loop
+from sim.launch.reference_loop import read_reference_loop
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(400)]
 

@@ -19,10 +19,10 @@ from companion.core.frames import Ned
 from companion.errors import CompanionError
 from companion.io.link import SERIAL_UNSENT_MOST, SerialLink
 from companion.wire.mavlink import FrameSplitter
-from sim.autopilot import Autopilot
-from sim.dynamics import GustParameters, NoiseParameters
-from sim.px4.parameters import defaults
-from sim.stub_fleet import FLEET_PARAMETERS
+from sim.autopilot.autopilot import Autopilot
+from sim.autopilot.dynamics import GustParameters, NoiseParameters
+from sim.autopilot.parameters import defaults
+from sim.autopilot.stub_fleet import FLEET_PARAMETERS
 
 pytestmark = pytest.mark.process
 BAUD = 921600

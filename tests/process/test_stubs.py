@@ -13,8 +13,8 @@ from pymavlink.dialects.v20 import development as mavlink
 from stub_process import fleet, launched, listening, running, wait_until_bound
 
 from companion.errors import CompanionError
-from sim.px4.faults import Fault, FaultKind, encode_order
-from sim.stubs import TRUTH_DTYPE, run_stubs
+from sim.autopilot.faults import Fault, FaultKind, encode_order
+from sim.autopilot.stubs import TRUTH_DTYPE, run_stubs
 
 pytestmark = pytest.mark.process
 

@@ -6,9 +6,9 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from companion.agent import Agent
 from companion.config import FleetConfig
 from companion.core.values import Instant
+from companion.vehicle.agent import Agent
 from companion.wire.mavlink import dialect
 
 

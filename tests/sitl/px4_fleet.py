@@ -14,12 +14,12 @@ import numpy as np
 import numpy.typing as npt
 from fleet_process import Fleet, Process, flight_folder, make_fleet, operator_of, started, wait_status
 
-from companion.core.plan import Programme
+from companion.core.trajectory import TrajectoryHistory
 from companion.io.recorder import read_recording
-from companion.operate import Operator
+from companion.operator.client import Operator
 from companion.wire.mavlink import Px4Mode, dialect, mode_parameters
-from sim.stubs import TRUTH_DTYPE
-from sim.summary import Flight as Account
+from sim.autopilot.stubs import TRUTH_DTYPE
+from sim.launch.summary import Flight as PreflightReport
 
 PATIENCE_S = 180.0
 ALTITUDE_M = 5.0
@@ -94,12 +94,12 @@ class Flying:
             if e.channel == "output/mavlink" and e.body[7] | e.body[8] << 8 | e.body[9] << 16 == SETPOINT
         ]
 
-    def programme(self) -> Programme:
+    def history(self) -> TrajectoryHistory:
         """The motions that the vehicles followed, from their recordings; after the flight's end."""
-        account = Account(self.fleet.config, seed=0, truth=np.zeros(0), takeoff_ns=0)
+        account = PreflightReport(self.fleet.config, seed=0, truth=np.zeros(0), takeoff_ns=0)
         for i in self.fleet.ids:
             account.read(i, read_recording(self.folder / f"vehicle-{i}.mcap").entries)
-        return account.programme()
+        return account.history()
 
     def pilot(self, vehicle_id: int, mode: Px4Mode) -> int:
         """A ground station changes the mode; returns when (UTC, ns)."""

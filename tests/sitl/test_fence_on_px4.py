@@ -15,8 +15,8 @@ import pytest
 from fleet_process import Fleet, eventually, operator_of, run, started, truth, wait_status
 from px4_fleet import PATIENCE_S, flying, sitl_fleet
 
-from companion.core.safety import COLLISION_DISTANCE_M
-from companion.operate import Operator, PreflightError
+from companion.core.safety.filter import COLLISION_DISTANCE_M
+from companion.operator.client import Operator, PreflightError
 
 RADIUS_M, MARGIN_M = 30.0, 2.0
 FENCE = {"radius_m": RADIUS_M, "margin_m": MARGIN_M, "floor_m": 2.0, "ceiling_m": 8.0}
@@ -29,7 +29,7 @@ LITTLE_DRAG = "SIH_KDV=0.2"
 """N/(m/s) at 1 kg, as the stub's; PX4's 1.0 would keep the vehicle below the speed limit, and brake it"""
 MOVE_M_S = 3.0
 """the fastest that an operator may ask for at that speed limit"""
-IN_THE_AIR = ("waiting", "apart")
+IN_THE_AIR = ("waiting", "detached")
 PRESSING_S = 30.0
 """of which ten bring it to the fence"""
 REST_S = 10.0
@@ -131,7 +131,7 @@ def test_a_move_for_ever_ends_at_the_fence_on_px4(tmp_path: Path, build: Path, r
         nearest_m = flight.minimum_distance_m(fleet.ids, began_ns)
         flight.up.signal(signal.SIGINT)
         flight.up.wait(120.0)
-        planned = flight.programme().at(ended_ns).moment(ended_ns).centre.position
+        planned = flight.history().at(ended_ns).state_at(ended_ns).centre.position
     farthest_m, fastest_m_s, rest_m_s = {}, {}, {}
     for i, rows in tracks.items():
         flown = rows[(rows["time_unix_ns"] >= began_ns) & (rows["time_unix_ns"] <= ended_ns)]

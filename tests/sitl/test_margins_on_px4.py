@@ -44,7 +44,7 @@ class Margin:
 
 def measured(flight: Flying, begin_ns: int, held_s: list[float]) -> Margin:
     """Between `begin_ns` and WINDOW_S later (UTC, ns), after the flight's end."""
-    programme = flight.programme()
+    history = flight.history()
     times = np.arange(begin_ns, begin_ns + round(WINDOW_S * 1e9), STEP_NS)
     tracks = {i: flight.truth(i) for i in flight.fleet.ids}
 
@@ -58,8 +58,8 @@ def measured(flight: Flying, begin_ns: int, held_s: list[float]) -> Margin:
     p, v = motion("position_ned_m"), motion("velocity_ned_m_s")
     formation = []
     for time_ns, places in zip(times, p, strict=True):
-        planned = programme.at(int(time_ns))
-        moment = planned.moment(int(time_ns))
+        planned = history.at(int(time_ns))
+        moment = planned.state_at(int(time_ns))
         slots = np.array([moment.slot(planned.slots[i]).position_ned_m for i in tracks])
         formation.append(np.square(formation_error_m(places, slots)).mean())
     relative = v[:, :, :2] - v[:, :, :2].mean(axis=1, keepdims=True)

@@ -9,7 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import development as dialect
 
-from companion.autopilot import (
+from companion.core.frames import Geodetic, Ned, ned_to_geodetic
+from companion.core.values import Instant
+from companion.vehicle.autopilot.client import (
     LATENCY_WINDOW_NS,
     PARAMETER_PERIOD_NS,
     PARAMETER_TRIES,
@@ -19,11 +21,9 @@ from companion.autopilot import (
     AutopilotClient,
     BootClock,
 )
-from companion.core.frames import Geodetic, Ned, ned_to_geodetic
-from companion.core.values import Instant
-from companion.preflight import PARAMETERS
+from companion.vehicle.preflight import PARAMETERS
 from companion.wire import mavlink as wire
-from companion.wire.mavlink import MavlinkLink, Px4Mode
+from companion.wire.mavlink import MavlinkCodec, Px4Mode
 
 SYSTEM_ID = 7
 FLEET = Geodetic(47.397742, 8.545594, 488.0)
@@ -86,7 +86,7 @@ class Px4:
 
 
 def px4(origin: Geodetic | None = FLEET) -> Px4:
-    return Px4(AutopilotClient(MavlinkLink(SYSTEM_ID), origin))
+    return Px4(AutopilotClient(MavlinkCodec(SYSTEM_ID), origin))
 
 
 def ready(at_s: float = 10.0) -> Px4:

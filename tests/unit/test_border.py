@@ -3,13 +3,13 @@
 import json
 from pathlib import Path
 
-from companion.agent import Agent, Outputs
-from companion.border import ADVANCE_LIMIT_S, Border
 from companion.config import FleetConfig, load
 from companion.core.failsafe import Failsafe
 from companion.core.values import Instant
 from companion.io.recorder import Entry
-from companion.replay import OUTPUTS, replay
+from companion.io.replay import OUTPUTS, replay
+from companion.vehicle.agent import Agent, Outputs
+from companion.vehicle.border import ADVANCE_LIMIT_S, Border
 
 CONFIG = load(Path(__file__).resolve().parents[2] / "fleet.toml", lambda t: t.update(vehicle=t["vehicle"][:2]))
 UTC_NS = 1_790_000_000_000_000_000

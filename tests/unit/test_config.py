@@ -21,8 +21,8 @@ from companion.config import (
     serial_endpoint,
     udp_endpoint,
 )
-from companion.core.fence import Fence
-from companion.core.plan import GotoLeg, TurnLeg, VelocityLeg
+from companion.core.safety.fence import Fence
+from companion.core.trajectory import GotoLeg, TurnLeg, VelocityLeg
 from companion.errors import ConfigError
 from sim.__main__ import _resize, plan_legs
 

@@ -13,16 +13,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import companion
-from companion.agent import REJECTED, Agent
-from companion.autopilot import COUNTED
 from companion.config import load
 from companion.core.counts import OTHER, Counts, RefusalKind
 from companion.core.failsafe import Failsafe
 from companion.core.frames import Ned
 from companion.core.neighbours import COUNTED as SAMPLES_COUNTED
-from companion.core.plan import Motion, TurnLeg, VelocityLeg, with_formation, with_legs
-from companion.core.safety import ACTING
+from companion.core.safety.filter import ACTING
+from companion.core.trajectory import FleetTrajectory, TurnLeg, VelocityLeg, with_formation, with_legs
 from companion.core.values import Instant
+from companion.vehicle.agent import REJECTED, Agent
+from companion.vehicle.autopilot.client import COUNTED
 from companion.wire import mavlink
 from companion.wire.peer import encode_motion
 
@@ -76,18 +76,18 @@ def test_every_name_that_the_code_counts_under_is_among_those_its_counter_knows(
     assert {(file, name) for file, name in names if name not in known} == set()
 
 
-def formed(agent: Agent) -> Motion:
+def formed(agent: Agent) -> FleetTrajectory:
     return with_formation(
-        agent.programme.newest, at_ns=NOW.fleet_ns, issuer=0, shape=FLEET.formation.shape,
+        agent.history.newest, at_ns=NOW.fleet_ns, issuer=0, shape=FLEET.formation.shape,
         slots=FLEET.slots(FLEET.formation.shape), pinned=FLEET.pinned, speed_m_s=1.0,
     )  # fmt: skip
 
 
-def refused(sound: Motion) -> dict[RefusalKind, Motion]:
+def refused(sound: FleetTrajectory) -> dict[RefusalKind, FleetTrajectory]:
     """Motions that are refused, by the reason."""
     at_ns = NOW.fleet_ns + 1_000_000_000
 
-    def flown(*legs: VelocityLeg | TurnLeg) -> Motion:
+    def flown(*legs: VelocityLeg | TurnLeg) -> FleetTrajectory:
         return with_legs(sound, at_ns=at_ns, issuer=0, legs=legs)
 
     return {

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim.dynamics import (
+from sim.autopilot.dynamics import (
     HOLD_STILL,
     DynamicsParameters,
     GustParameters,

@@ -11,15 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely import LineString, Point, Polygon
 
-from companion.core.fence import (
+from companion.core.frames import Ned
+from companion.core.safety.fence import (
     FENCE_POLE_PER_S,
     RETURN_SPEED_M_S,
     Fence,
     braking_pole_per_s,
     wall_plane,
 )
-from companion.core.frames import Ned
-from companion.core.safety import SafetyFilter, SafetyLimits, half_plane
+from companion.core.safety.filter import SafetyFilter, SafetyLimits, half_plane
 from companion.core.values import Command, Neighbour, SafeSetpoint, VehicleState
 
 PROPERTY = settings(deadline=None, max_examples=60)

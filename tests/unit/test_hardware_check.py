@@ -23,7 +23,7 @@ def test_a_clock_is_synchronised_or_not_or_nobody_can_tell(
     kernel: tuple[bool, float] | None, value: str, met: bool
 ) -> None:
     row = clock_check(kernel)
-    assert (row.value, row.met) == (value, met)
+    assert (row.value, row.passed) == (value, met)
 
 
 def test_the_kernel_tells_of_its_clock_or_that_it_does_not() -> None:
@@ -33,7 +33,7 @@ def test_the_kernel_tells_of_its_clock_or_that_it_does_not() -> None:
 
 def test_a_folder_is_written_to_and_left_as_it_was(tmp_path: Path) -> None:
     rows = {c.name: c for c in disk_checks(tmp_path)}
-    assert rows["recording folder"].met
+    assert rows["recording folder"].passed
     speed = rows["disk speed"].value
     assert isinstance(speed, float)
     assert speed > 0.0
@@ -47,8 +47,8 @@ def test_the_speed_is_what_was_written_over_the_time_it_took(tmp_path: Path) -> 
 
 def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
     (row,) = disk_checks(tmp_path / "none")
-    assert not row.met
-    assert row.says == f"{tmp_path / 'none'}: No such file or directory"
+    assert not row.passed
+    assert row.message == f"{tmp_path / 'none'}: No such file or directory"
 
 
 def test_a_serial_line_that_is_not_there_is_named_and_the_rest_is_looked_at(tmp_path: Path) -> None:
@@ -59,4 +59,4 @@ def test_a_serial_line_that_is_not_there_is_named_and_the_rest_is_looked_at(tmp_
         if row.name == "system clock":
             break
     assert [r.name for r in rows] == ["link", "system clock"]
-    assert "cannot open serial line /dev/none" in rows[0].says
+    assert "cannot open serial line /dev/none" in rows[0].message

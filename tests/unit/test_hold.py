@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from companion.core.hold import HoldKind, Weights, axis, damped, weights
+from companion.core.prediction import HoldKind, Weights, axis, damped, weights
 
 PROPERTY = settings(deadline=None, max_examples=60)
 values = st.floats(-100.0, 100.0)

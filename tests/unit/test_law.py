@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from companion.core.frames import Ned
-from companion.core.law import (
+from companion.core.law.starling import (
     NO_SUMS,
     Gains,
     StarlingLaw,
@@ -25,9 +25,9 @@ from companion.core.law import (
     total,
     within_budget,
 )
-from companion.core.plan import Reference
+from companion.core.trajectory import Reference
 from companion.core.values import Neighbour, VehicleState
-from sim.broken_law import GAIN_PER_S, PUSH_MAX_M_S2, BrokenLaw
+from sim.study.broken_law import GAIN_PER_S, PUSH_MAX_M_S2, BrokenLaw
 
 PROPERTY = settings(deadline=None, max_examples=40)
 FLIGHT = Gains(3.0, 3.0, 4.0, 1.0, 0.3, 2.0, 5.0, 1.0, 1.0, 1.0)
@@ -312,7 +312,7 @@ def test_the_law_that_is_flown_is_its_formulas_in_the_level_plane(
     u_sep, alignment, cohesion, residuals = np.zeros(3), np.zeros(3), np.zeros(3), []
     for n in neighbours:
         formed = n.in_formation and not alone
-        if formed or n.other_end_ned_m is None:
+        if formed or n.last_seen_ned_m is None:
             x = np.array(ego.position_ned_m) - np.array(n.position_ned_m)
             r = max(float(np.linalg.norm(x)), 0.2)
             u_sep += g.k_s * max(1 / r**2 - 1 / g.r0**2, 0.0) * flat(Ned(*x)) / r

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from companion.errors import CompanionError
-from sim.lock import only_flight
+from sim.launch.lock import only_flight
 
 
 def test_a_second_launcher_of_a_name_is_refused_with_what_to_do(tmp_path: Path) -> None:
@@ -28,7 +28,7 @@ def test_another_name_and_the_same_name_afterwards_are_free(tmp_path: Path) -> N
 
 def test_a_killed_launcher_leaves_a_file_and_no_lock(tmp_path: Path) -> None:
     code = (
-        "import os, pathlib, signal, sys; from sim.lock import only_flight\n"
+        "import os, pathlib, signal, sys; from sim.launch.lock import only_flight\n"
         "with only_flight('kestrel', pathlib.Path(sys.argv[1])): os.kill(os.getpid(), signal.SIGKILL)"
     )
     assert subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=False).returncode == -9

@@ -12,11 +12,24 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.agent import Agent
 from companion.config import FleetConfig, load
 from companion.core.budget import Bucket, ExaminationBudget
 from companion.core.frames import Ned
-from companion.core.motion_check import (
+from companion.core.route import LOOKS_MAX
+from companion.core.trajectory import (
+    BLEND_MIN_S,
+    GOTO_MIN_S,
+    FleetTrajectory,
+    GotoLeg,
+    Leg,
+    SlotChange,
+    TrajectoryState,
+    TurnLeg,
+    VelocityLeg,
+    leg_duration_s,
+    with_legs,
+)
+from companion.core.trajectory_check import (
     DURATION_MAX_S,
     LEGS_MAX,
     PLACE_MAX_M,
@@ -27,23 +40,10 @@ from companion.core.motion_check import (
     VELOCITY_MAX_M_S,
     examine,
 )
-from companion.core.plan import (
-    BLEND_MIN_S,
-    GOTO_MIN_S,
-    GotoLeg,
-    Leg,
-    Moment,
-    Motion,
-    SlotChange,
-    TurnLeg,
-    VelocityLeg,
-    leg_duration_s,
-    with_legs,
-)
-from companion.core.route import LOOKS_MAX
 from companion.core.values import ZERO, Instant
 from companion.errors import ConfigError
-from companion.operate import turn_leg
+from companion.operator.client import turn_leg
+from companion.vehicle.agent import Agent
 from companion.wire.peer import decode_motion, encode_motion
 from sim.__main__ import plan_legs
 
@@ -66,13 +66,13 @@ FIRST = CONFIG.first_motion
 FORMED = replace(CONFIG.motion_into("v", FIRST, START_NS - 60 * 10**9, 0), revision=1)
 
 
-def flown(*legs: Leg, **changed: object) -> Motion:
+def flown(*legs: Leg, **changed: object) -> FleetTrajectory:
     """A motion that follows the formed fleet's."""
     motion = with_legs(FORMED, at_ns=START_NS + 3 * 10**9, issuer=0, legs=legs)
     return replace(motion, **changed)  # type: ignore[arg-type]
 
 
-def sentence(motion: Motion) -> str:
+def sentence(motion: FleetTrajectory) -> str:
     fault = examine(motion, LIMITS, FORMED).fault
     return "" if fault is None else fault.sentence
 
@@ -97,7 +97,7 @@ def test_a_motion_that_once_raised_is_refused_by_put_and_by_command(name: str) -
     payload = encode_motion(ONCE_RAISED[name])
     agent = Agent(CONFIG, 1, boot_id=1)
     agent.receive_peer("fleet/2/plan", payload, NOW)
-    assert agent.programme.newest.revision == 0
+    assert agent.history.newest.revision == 0
     assert sum(n for kind, n in agent.rejected.items() if kind.startswith("plan: ")) == 1
     order = b'{"verb":"motion","revision":1,"issuer":"x","motion":%s}' % payload
     answer = json.loads(agent.receive_command(order, NOW))
@@ -115,14 +115,14 @@ def test_a_turn_of_next_to_nothing_is_refused_where_it_is_read(angle: float) -> 
 # -- nothing that can be read raises or costs much -------------------------------------------------------------------
 
 
-class Counted(Motion):
+class Counted(FleetTrajectory):
     """A motion that counts how often it is looked at."""
 
     looked = 0
 
-    def moment(self, fleet_ns: int) -> Moment:
+    def state_at(self, fleet_ns: int) -> TrajectoryState:
         type(self).looked += 1
-        return super().moment(fleet_ns)
+        return super().state_at(fleet_ns)
 
 
 def extremes(low: float, high: float) -> st.SearchStrategy[float]:
@@ -158,7 +158,7 @@ readable = st.builds(
 )  # fmt: skip
 
 
-def started_together(motion: Motion) -> Motion:
+def started_together(motion: FleetTrajectory) -> FleetTrajectory:
     """The same with times as an honest one has them, which most that are drawn have not."""
     return replace(
         motion, start_ns=START_NS, legs_start_ns=START_NS, blend_start_ns=START_NS,
@@ -169,10 +169,12 @@ def started_together(motion: Motion) -> Motion:
 @settings(deadline=None, max_examples=300)
 @given(readable, st.booleans(), st.sampled_from([FORMED, FIRST, None]))
 def test_whatever_can_be_read_is_accepted_or_refused_with_a_sentence_at_a_bounded_cost(
-    motion: Motion, together: bool, before: Motion | None
+    motion: FleetTrajectory, together: bool, before: FleetTrajectory | None
 ) -> None:
     motion = started_together(motion) if together else motion
-    assert decode_motion(encode_motion(motion)) == Motion(**{f: getattr(motion, f) for f in Motion.__annotations__})
+    assert decode_motion(encode_motion(motion)) == FleetTrajectory(
+        **{f: getattr(motion, f) for f in FleetTrajectory.__annotations__}
+    )
     Counted.looked = 0
     fault, looks = examine(motion, LIMITS, before)
     assert fault is None or len(fault.sentence) > 10
@@ -182,7 +184,7 @@ def test_whatever_can_be_read_is_accepted_or_refused_with_a_sentence_at_a_bounde
 
 @settings(deadline=None, max_examples=60)
 @given(readable, st.booleans())
-def test_an_agent_takes_or_refuses_whatever_can_be_read(motion: Motion, together: bool) -> None:
+def test_an_agent_takes_or_refuses_whatever_can_be_read(motion: FleetTrajectory, together: bool) -> None:
     agent = Agent(CONFIG, 1, boot_id=1)
     motion = replace(started_together(motion) if together else motion, revision=motion.revision % 3)
     order = b'{"verb":"motion","revision":1,"issuer":"x","motion":%s}' % encode_motion(motion)
@@ -191,7 +193,7 @@ def test_an_agent_takes_or_refuses_whatever_can_be_read(motion: Motion, together
     agent.advance(NOW)
 
 
-def hard(random_: random.Random, count: int) -> Motion:
+def hard(random_: random.Random, count: int) -> FleetTrajectory:
     """Many legs beside the edge, with a formation that turns and changes."""
     edge = random_.choice([150.0, 185.0, 195.0])
     made: list[Leg] = []
@@ -214,7 +216,7 @@ def test_the_hardest_motions_known_take_bounded_looks_and_long_surveys_pass() ->
     random_ = random.Random(3)
     for _ in range(40):
         motion = hard(random_, random_.choice([2, 10, LEGS_MAX]))
-        counted = Counted(**{f: getattr(motion, f) for f in Motion.__annotations__})
+        counted = Counted(**{f: getattr(motion, f) for f in FleetTrajectory.__annotations__})
         Counted.looked = 0
         examine(counted, LIMITS, FORMED)
         assert Counted.looked < 3 * LOOKS_MAX
@@ -274,7 +276,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("motion", "words"), [r[1:] for r in REFUSED], ids=[r[0] for r in REFUSED])
-def test_a_motion_is_refused_for_what_is_wrong_with_it(motion: Motion, words: str) -> None:
+def test_a_motion_is_refused_for_what_is_wrong_with_it(motion: FleetTrajectory, words: str) -> None:
     assert words in sentence(motion)
     fault = examine(motion, LIMITS, FORMED).fault
     assert fault is not None
@@ -294,7 +296,7 @@ def test_a_motion_is_refused_for_what_is_wrong_with_it(motion: Motion, words: st
         CONFIG.motion_home(flown(VelocityLeg(Ned(2.5, 0.0, 0.0), 40.0)), START_NS + 20 * 10**9, 0),
     ],
 )  # fmt: skip
-def test_what_an_honest_fleet_flies_is_not_refused(motion: Motion) -> None:
+def test_what_an_honest_fleet_flies_is_not_refused(motion: FleetTrajectory) -> None:
     before = replace(FORMED, slots=motion.slots) if motion.shape == "v" else FORMED
     fault = examine(motion, LIMITS, before).fault
     assert fault is None or (fault.kind == "its slots meet" and motion.shape == "v"), fault
@@ -316,12 +318,12 @@ def test_a_stop_is_taken_wherever_it_happens() -> None:
 # -- legs after turns are flown at the speed asked for -----------------------------------------------------------------
 
 
-def peak_m_s(motion: Motion, leg: int) -> float:
+def peak_m_s(motion: FleetTrajectory, leg: int) -> float:
     """The centre's greatest speed within a leg, looked at in 160 parts: to 1e-4."""
     since, _, v, _ = motion.leg_starts[leg]
     whole = leg_duration_s(motion.legs[leg], v)
     times = (motion.legs_start_ns + round((since + whole * k / 160) * 1e9) for k in range(161))
-    return max(hypot(*motion.moment(t).centre.velocity) for t in times)
+    return max(hypot(*motion.state_at(t).centre.velocity) for t in times)
 
 
 def unfenced(tables: list[dict[str, Any]]) -> FleetConfig:
@@ -332,7 +334,7 @@ def unfenced(tables: list[dict[str, Any]]) -> FleetConfig:
     return load(FILE, change)
 
 
-def planned(text: str) -> tuple[FleetConfig, Motion]:
+def planned(text: str) -> tuple[FleetConfig, FleetTrajectory]:
     config = unfenced(plan_legs(text))
     formed = replace(FORMED, blend_s=0.0, slots={i: SlotChange(c.after, c.after) for i, c in FORMED.slots.items()})
     return config, with_legs(formed, at_ns=START_NS, issuer=0, legs=config.plan_legs(formed.centre_ned_m))
@@ -390,7 +392,7 @@ def test_a_thousand_random_plans_fly_their_waypoints_at_the_speed_asked_for_with
                 since, _, _, _ = motion.leg_starts[leg]
                 whole = leg_duration_s(motion.legs[leg], v)
                 bend = max(
-                    hypot(*motion.moment(START_NS + round((since + whole * k / 300) * 1e9)).centre.acceleration)
+                    hypot(*motion.state_at(START_NS + round((since + whole * k / 300) * 1e9)).centre.acceleration)
                     for k in range(301)
                 )
                 assert bend == pytest.approx(1.0, rel=0.01) or whole == pytest.approx(1.0), (text, leg)
@@ -406,7 +408,7 @@ def test_a_steep_waypoint_is_flown_within_the_vertical_limits(altitude: float, m
     waypoint = {"kind": "goto", "north_m": 3.0, "east_m": 0.0, "altitude_m": altitude, "speed_m_s": 3.0}
     config = unfenced([waypoint])
     motion = with_legs(FORMED, at_ns=START_NS, issuer=0, legs=config.plan_legs(FORMED.centre_ned_m))
-    fastest = max(abs(motion.moment(START_NS + k * 10**8).centre.velocity.down) for k in range(1000))
+    fastest = max(abs(motion.state_at(START_NS + k * 10**8).centre.velocity.down) for k in range(1000))
     assert fastest == pytest.approx(may, rel=0.01)
 
 
@@ -465,7 +467,7 @@ def test_a_flood_of_the_hardest_plans_costs_looks_that_do_not_grow_with_it() -> 
     later = Instant(NOW.monotonic_ns + 30 * 10**9, NOW.fleet_ns + 10 * 10**9)
     good = CONFIG.motion_into("v", FIRST, later.fleet_ns + 3 * 10**9, 2)
     agent.receive_peer("fleet/2/plan", encode_motion(good), later)
-    assert agent.programme.newest.revision == 1
+    assert agent.history.newest.revision == 1
 
 
 def test_the_same_unsound_plan_again_is_not_examined_again() -> None:

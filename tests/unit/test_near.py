@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.core.frames import Ned
-from companion.core.hold import axis, weights
 from companion.core.monitor import PeerMotion, unheard_error_m
 from companion.core.near import (
     MISSING_MAX_M,
@@ -19,7 +18,8 @@ from companion.core.near import (
     near_bound_m,
     near_push_m_s2,
 )
-from companion.core.safety import HalfPlane, half_plane, push_m_s2, resting_push_m_s2
+from companion.core.prediction import axis, weights
+from companion.core.safety.filter import HalfPlane, half_plane, push_m_s2, resting_push_m_s2
 from companion.core.trigger import PeriodicTrigger, Situation
 from companion.core.values import ZERO, Neighbour, VehicleState
 

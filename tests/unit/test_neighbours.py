@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from companion.core.formation import shape_slots
 from companion.core.frames import Ned
-from companion.core.hold import HoldKind
 from companion.core.monitor import PeerMotion, unheard_error_m
 from companion.core.near import MISSING_MAX_M, certain_age_s
 from companion.core.neighbours import (
@@ -21,11 +20,12 @@ from companion.core.neighbours import (
     UNCERTAINTY_GROWTH_MAX_M,
     PeerLimits,
     PeerTable,
-    held,
     is_outlier,
+    predict_sample,
 )
-from companion.core.plan import Motion, Programme, SlotChange, TurnLeg, VelocityLeg, with_legs
-from companion.core.safety import nearest_hypothesis
+from companion.core.prediction import HoldKind
+from companion.core.safety.filter import nearest_hypothesis
+from companion.core.trajectory import FleetTrajectory, SlotChange, TrajectoryHistory, TurnLeg, VelocityLeg, with_legs
 from companion.core.values import Instant, Neighbour, PeerMessage, PeerSample, Phase
 
 PROPERTY = settings(deadline=None, max_examples=60)
@@ -50,7 +50,7 @@ def at(seconds: float) -> Instant:
     return Instant(round(seconds * 1e9), ns(seconds))
 
 
-def column_at_1_m_s(count: int = 5, **changed: object) -> Motion:
+def column_at_1_m_s(count: int = 5, **changed: object) -> FleetTrajectory:
     """Vehicles 1, 2, ... in a column northward at 1 m/s, 4 m apart."""
     slots = shape_slots("column", count, 4.0)
     values: dict[str, object] = {
@@ -59,18 +59,18 @@ def column_at_1_m_s(count: int = 5, **changed: object) -> Motion:
         "legs_start_ns": START_NS, "centre_ned_m": Ned(0.0, 0.0, -10.0), "velocity_ned_m_s": Ned(1.0, 0.0, 0.0),
         "heading_rad": 0.0, "heading_rate_rad_s": 0.0, "heading_follows_turns": False, "legs": (),
     }  # fmt: skip
-    return Motion(**(values | changed))  # type: ignore[arg-type]
+    return FleetTrajectory(**(values | changed))  # type: ignore[arg-type]
 
 
-def table(motion: Motion | None = None, **limits: object) -> PeerTable:
+def table(motion: FleetTrajectory | None = None, **limits: object) -> PeerTable:
     motion = motion or column_at_1_m_s()
     changed = replace(LIMITS, **limits)  # type: ignore[arg-type]
-    return PeerTable(OWN, frozenset(motion.slots) - {OWN}, changed, Programme([motion]))
+    return PeerTable(OWN, frozenset(motion.slots) - {OWN}, changed, TrajectoryHistory([motion]))
 
 
 def sample(t: PeerTable, vehicle: int, seconds: float, phase: Phase = Phase.FORMED, **changed: object) -> PeerSample:
     """Of a vehicle in its slot."""
-    r = t.programme.reference(vehicle, ns(seconds))
+    r = t.history.reference(vehicle, ns(seconds))
     made = PeerSample(vehicle, ns(seconds), r.position_ned_m, r.velocity_ned_m_s, 1, phase)
     return made._replace(**changed)
 
@@ -81,8 +81,8 @@ def message(s: PeerSample, sequence: int = 1, boot_id: int = 7, digest: tuple[Pe
 
 def predicted(t: PeerTable, seconds: float, gated: bool = False) -> dict[int, Neighbour]:
     now = at(seconds)
-    motion = t.programme.at(now.fleet_ns)
-    moment = motion.moment(now.fleet_ns)
+    motion = t.history.at(now.fleet_ns)
+    moment = motion.state_at(now.fleet_ns)
     own = moment.slot(motion.slots[OWN]).position_ned_m
     return {n.vehicle_id: n for n in t.predict(own, now, moment, gated)}
 
@@ -90,8 +90,8 @@ def predicted(t: PeerTable, seconds: float, gated: bool = False) -> dict[int, Ne
 def places(t: PeerTable, seconds: float, vehicle: int) -> list[Neighbour]:
     """Every place that is kept clear of for one vehicle."""
     now = at(seconds)
-    motion = t.programme.at(now.fleet_ns)
-    moment = motion.moment(now.fleet_ns)
+    motion = t.history.at(now.fleet_ns)
+    moment = motion.state_at(now.fleet_ns)
     found = t.predict(moment.slot(motion.slots[OWN]).position_ned_m, now, moment, False)
     return [n for n in found if n.vehicle_id == vehicle]
 
@@ -231,7 +231,7 @@ def test_receiver_predicts_what_the_sender_compares_with(
         Ned(*map(sum, zip(r.velocity_ned_m_s, drift, strict=True))), 1, phase,
     )  # fmt: skip
     t.accept(message(sent), at(20.0))
-    sender = held(
+    sender = predict_sample(
         sent, (r.position_ned_m, r.velocity_ned_m_s), turn.reference(3, ns(20.0 + age_s)), ns(20.0 + age_s), t.limits
     )
     n = predicted(t, 20.0 + age_s)[3]
@@ -261,17 +261,17 @@ def test_a_climbing_peer_stays_over_its_spot_and_comes_to_rest() -> None:
     assert n.velocity_ned_m_s == pytest.approx((0.0, 0.0, 0.0), abs=0.01)
     assert not n.in_formation
     assert not n.shares_avoidance
-    assert n.other_end_ned_m is None
+    assert n.last_seen_ned_m is None
 
 
 def test_a_peer_that_ends_as_it_is_armed_may_be_anywhere_up_to_its_altitude() -> None:
     t = table()
     t.accept(message(sample(t, 2, 0.0, Phase.ARMED, position_ned_m=Ned(5.0, 6.0, 0.0))), at(0.0))
-    assert predicted(t, 0.1)[2].other_end_ned_m is None
+    assert predicted(t, 0.1)[2].last_seen_ned_m is None
     t.presence(2, False, at(0.1))
     n = predicted(t, 5.0)[2]
     assert n.position_ned_m == Ned(5.0, 6.0, -10.0)
-    assert n.other_end_ned_m == Ned(5.0, 6.0, 0.0)
+    assert n.last_seen_ned_m == Ned(5.0, 6.0, 0.0)
     assert not n.shares_avoidance
     assert n.uncertainty_m > LIMITS.uncertainty_m
 
@@ -288,14 +288,14 @@ def test_a_silent_peer_that_climbed_or_landed_is_somewhere_in_its_column() -> No
     for phase, end in ((Phase.CLIMBING, -10.0), (Phase.LANDING, 0.0)):
         t = table()
         t.accept(message(sample(t, 2, 0.0, phase, position_ned_m=Ned(5.0, 6.0, -3.0))), at(0.0))
-        assert predicted(t, 11.9)[2].other_end_ned_m is None
+        assert predicted(t, 11.9)[2].last_seen_ned_m is None
         n = predicted(t, 12.5)[2]
         assert n.position_ned_m == Ned(5.0, 6.0, end)
-        assert n.other_end_ned_m == Ned(5.0, 6.0, -3.0)
+        assert n.last_seen_ned_m == Ned(5.0, 6.0, -3.0)
         assert n.uncertainty_m > LIMITS.uncertainty_m
 
 
-@pytest.mark.parametrize("phase", [Phase.RELEASED, Phase.APART, Phase.IDLE])
+@pytest.mark.parametrize("phase", [Phase.RELEASED, Phase.DETACHED, Phase.IDLE])
 def test_a_peer_that_follows_no_plan_is_predicted_by_its_own_velocity_which_fades(phase: Phase) -> None:
     t = table()
     v = Ned(1.0, -0.5, 0.2)
@@ -373,7 +373,7 @@ def test_a_peer_that_is_not_ours_to_move_is_where_it_was(phase: Phase) -> None:
     t = table()
     t.accept(message(sample(t, 2, 0.0, phase)), at(0.0))
     n = predicted(t, 9.0)[2]
-    assert n.position_ned_m == t.programme.reference(2, ns(0.0)).position_ned_m
+    assert n.position_ned_m == t.history.reference(2, ns(0.0)).position_ned_m
     assert n.velocity_ned_m_s == ZERO
     assert not n.shares_avoidance
 
@@ -399,18 +399,18 @@ def test_a_sample_from_slightly_ahead_counts_as_new() -> None:
     t.accept(message(s), at(5.0))
     n = predicted(t, 5.0)[2]
     assert n.age_s == 0.0
-    assert n.position_ned_m == pytest.approx(t.programme.reference(2, ns(5.0)).position_ned_m)
+    assert n.position_ned_m == pytest.approx(t.history.reference(2, ns(5.0)).position_ned_m)
 
 
 def test_after_a_new_motion_old_samples_are_held_under_it() -> None:
     t = table()
     t.accept(message(sample(t, 2, 5.0)), at(5.0))
-    t.programme.adopt(with_legs(t.programme.newest, at_ns=ns(4.0), issuer=1, legs=(VelocityLeg(ZERO, 0.0),)))
+    t.history.adopt(with_legs(t.history.newest, at_ns=ns(4.0), issuer=1, legs=(VelocityLeg(ZERO, 0.0),)))
     t.plan_changed()
     s = t.sample(2)
     assert s is not None
-    then, now = (t.programme.reference(2, ns(x)) for x in (5.0, 9.0))
-    expected = held(s, (then.position_ned_m, then.velocity_ned_m_s), now, ns(9.0), t.limits)
+    then, now = (t.history.reference(2, ns(x)) for x in (5.0, 9.0))
+    expected = predict_sample(s, (then.position_ned_m, then.velocity_ned_m_s), now, ns(9.0), t.limits)
     n = predicted(t, 9.0)[2]
     assert (n.position_ned_m, n.velocity_ned_m_s) == expected
 
@@ -528,7 +528,7 @@ def test_a_lost_peer_that_spoke_in_near_mode_is_held_as_lost_and_not_as_late() -
     t.accept(replace(message(sample(t, 2, 0.0)), due_soon=True), at(0.0))
     t.presence(2, False, at(1.0))
     n = predicted(t, 2.0)[2]
-    assert n.other_end_ned_m is not None
+    assert n.last_seen_ned_m is not None
     assert n.uncertainty_m == pytest.approx(LIMITS.uncertainty_m + UNCERTAINTY_GROWTH_M_S)
 
 
@@ -557,8 +557,8 @@ def test_a_silent_peer_may_have_stopped_right_after_its_last_sample() -> None:
     s = sample(t, 2, 0.0)
     t.accept(message(s), at(0.0))
     n = predicted(t, 14.0)[2]
-    assert n.other_end_ned_m == pytest.approx(s.position_ned_m)
-    assert n.position_ned_m == pytest.approx(t.programme.reference(2, ns(14.0)).position_ned_m)
+    assert n.last_seen_ned_m == pytest.approx(s.position_ned_m)
+    assert n.position_ned_m == pytest.approx(t.history.reference(2, ns(14.0)).position_ned_m)
     assert n.velocity_ned_m_s == pytest.approx((1.0, 0.0, 0.0))
 
 
@@ -567,9 +567,9 @@ def test_a_peer_whose_presence_ended_flew_on_until_shortly_before() -> None:
     t.accept(message(sample(t, 2, 0.0)), at(0.0))
     t.presence(2, False, at(6.0))
     n = predicted(t, 8.0)[2]
-    stopped = t.programme.reference(2, ns(6.0 - PRESENCE_DELAY_S)).position_ned_m
-    assert n.other_end_ned_m == pytest.approx(stopped)
-    assert n.position_ned_m == pytest.approx(t.programme.reference(2, ns(8.0)).position_ned_m)
+    stopped = t.history.reference(2, ns(6.0 - PRESENCE_DELAY_S)).position_ned_m
+    assert n.last_seen_ned_m == pytest.approx(stopped)
+    assert n.position_ned_m == pytest.approx(t.history.reference(2, ns(8.0)).position_ned_m)
     assert not n.shares_avoidance
 
 
@@ -578,14 +578,14 @@ def test_a_peer_heard_just_before_its_end_did_not_stop_before_that() -> None:
     s = sample(t, 2, 5.8)
     t.accept(message(s), at(5.8))
     t.presence(2, False, at(6.0))
-    assert predicted(t, 6.0)[2].other_end_ned_m == pytest.approx(s.position_ned_m)
+    assert predicted(t, 6.0)[2].last_seen_ned_m == pytest.approx(s.position_ned_m)
 
 
 def test_a_lost_peer_flies_on_no_longer_than_it_would_alone() -> None:
     t = table()
     t.accept(message(sample(t, 2, 0.0)), at(0.0))
     t.presence(2, False, at(1.0))
-    last = t.programme.reference(2, ns(1.0 + LIMITS.isolated_flight_s)).position_ned_m
+    last = t.history.reference(2, ns(1.0 + LIMITS.isolated_flight_s)).position_ned_m
     for seconds in (6.0, 7.0, 60.0):
         n = predicted(t, seconds)[2]
         assert n.position_ned_m == pytest.approx(last)
@@ -606,8 +606,8 @@ def test_a_lost_peer_is_a_neighbour_while_either_of_its_ends_is_in_range() -> No
     t.accept(message(sample(t, 2, 0.0)), at(0.0))
     t.presence(2, False, at(0.5))
     now = at(20.0)
-    moment = t.programme.newest.moment(now.fleet_ns)
-    last, stopped = (t.programme.reference(2, ns(x)).position_ned_m for x in (5.5, 0.0))
+    moment = t.history.newest.state_at(now.fleet_ns)
+    last, stopped = (t.history.reference(2, ns(x)).position_ned_m for x in (5.5, 0.0))
     beyond = Ned(last.north + 5.9, last.east, last.down)
     behind = Ned(stopped.north - 5.9, stopped.east, stopped.down)
     assert [len(t.predict(ego, now, moment, False)) for ego in (beyond, behind)] == [1, 1]
@@ -622,11 +622,11 @@ def test_a_lost_peer_is_a_neighbour_beside_the_middle_of_its_line(beside_m: floa
     t.accept(message(sample(t, 2, 0.0)), at(0.0))
     t.presence(2, False, at(0.5))
     now = at(20.0)
-    last, stopped = (t.programme.reference(2, ns(x)).position_ned_m for x in (5.5, 0.0))
+    last, stopped = (t.history.reference(2, ns(x)).position_ned_m for x in (5.5, 0.0))
     assert dist(last, stopped) > 3.0
     middle = [0.5 * (a + b) for a, b in zip(last, stopped, strict=True)]
     ego = Ned(middle[0], middle[1], middle[2] - beside_m)
-    assert len(t.predict(ego, now, t.programme.newest.moment(now.fleet_ns), False)) == heard
+    assert len(t.predict(ego, now, t.history.newest.state_at(now.fleet_ns), False)) == heard
 
 
 @pytest.mark.parametrize("phase", [Phase.LANDED, Phase.PREFLIGHT, Phase.IDLE])
@@ -636,7 +636,7 @@ def test_a_lost_peer_that_stood_on_the_ground_has_one_place(phase: Phase) -> Non
     t.accept(message(sample(t, 2, 0.0, phase, position_ned_m=pad, velocity_ned_m_s=ZERO)), at(0.0))
     t.presence(2, False, at(1.0))
     n = predicted(t, 30.0)[2]
-    assert n.other_end_ned_m is None
+    assert n.last_seen_ned_m is None
     assert n.position_ned_m == pad
 
 
@@ -644,10 +644,10 @@ def test_a_lost_peer_whose_companion_had_started_in_flight_is_there_or_beneath()
     t = table()
     there = Ned(4.0, 0.0, -8.0)
     t.accept(message(sample(t, 2, 0.0, Phase.IDLE, position_ned_m=there, velocity_ned_m_s=ZERO)), at(0.0))
-    assert predicted(t, 1.0)[2].other_end_ned_m is None
+    assert predicted(t, 1.0)[2].last_seen_ned_m is None
     t.presence(2, False, at(1.0))
     n = predicted(t, 30.0)[2]
-    assert {n.position_ned_m, n.other_end_ned_m} == {there, there._replace(down=0.0)}
+    assert {n.position_ned_m, n.last_seen_ned_m} == {there, there._replace(down=0.0)}
 
 
 def lost_by_presence(**limits: object) -> PeerTable:
@@ -678,7 +678,7 @@ def test_a_late_message_from_before_its_end_brings_nobody_back() -> None:
     assert t.accept(message(sample(t, 2, 5.5), 2), at(6.5)) is None
     n = predicted(t, 7.0)[2]
     assert not n.in_formation
-    assert n.other_end_ned_m == pytest.approx(t.programme.reference(2, ns(5.5)).position_ned_m)
+    assert n.last_seen_ned_m == pytest.approx(t.history.reference(2, ns(5.5)).position_ned_m)
     assert t.phases()[2] is None
 
 
@@ -696,7 +696,7 @@ def test_hearsay_brings_a_silent_peer_back() -> None:
     t.accept(message(sample(t, 3, 13.0), digest=(sample(t, 2, 9.0),)), at(13.0))
     n = predicted(t, 13.0)[2]
     assert n.in_formation
-    assert n.other_end_ned_m is None
+    assert n.last_seen_ned_m is None
 
 
 # -- one examination for every sample ----------------------------------------------------------------------------------
@@ -714,7 +714,7 @@ def heard(t: PeerTable, vehicle: int = 2, until_s: int = 4) -> PeerTable:
 
 
 @pytest.mark.parametrize("boot_id", [7, 8])
-@pytest.mark.parametrize("phase", [Phase.FORMED, Phase.APART, Phase.LANDED, Phase.IDLE])
+@pytest.mark.parametrize("phase", [Phase.FORMED, Phase.DETACHED, Phase.LANDED, Phase.IDLE])
 def test_a_state_that_nothing_explains_is_another_place_beside_the_old_one(boot_id: int, phase: Phase) -> None:
     t = heard(table())
     lie = moved(sample(t, 2, 5.0, phase), north=30.0)
@@ -832,7 +832,7 @@ def test_one_lost_in_the_air_comes_back_near_where_it_may_be_or_beneath(down: fl
     t.accept(message(sample(t, 2, 20.0, Phase.IDLE, position_ned_m=near, velocity_ned_m_s=ZERO), 1, 8), at(20.0))
     (n,) = places(t, 20.0, 2)
     assert n.position_ned_m == near
-    assert n.other_end_ned_m is None
+    assert n.last_seen_ned_m is None
 
 
 # -- the path of the lost, and who hears nobody ------------------------------------------------------------------------
@@ -844,12 +844,12 @@ def test_a_peer_lost_in_a_turn_is_kept_clear_of_along_its_arc_and_not_its_chord(
     t.accept(message(sample(t, 2, 20.0)), at(20.0))
     t.presence(2, False, at(21.0))
     now = at(34.0)
-    moment = turn.moment(now.fleet_ns)
+    moment = turn.state_at(now.fleet_ns)
     for second in range(20, 35):
         on_the_arc = turn.reference(2, ns(float(second))).position_ned_m
         (n,) = (n for n in t.predict(on_the_arc, now, moment, False) if n.vehicle_id == 2)
-        assert n.other_end_ned_m is not None
-        assert dist(n.position_ned_m, n.other_end_ned_m) <= 0.201
+        assert n.last_seen_ned_m is not None
+        assert dist(n.position_ned_m, n.last_seen_ned_m) <= 0.201
         assert dist(nearest_hypothesis(on_the_arc, n)[0], on_the_arc) < 0.03
     a, b = (turn.reference(2, ns(x)).position_ned_m for x in (20.0, 34.0))
     middle = Ned(*(0.5 * (x + y) for x, y in zip(a, b, strict=True)))
@@ -870,8 +870,8 @@ def test_who_hears_nobody_is_deaf_when_heartbeats_of_all_are_missing() -> None:
     assert len([n for i, n in predicted(t, 17.9).items() if n.in_formation]) == 4
     lost = predicted(t, 19.1)
     assert not any(n.in_formation for n in lost.values())
-    assert lost[3].other_end_ned_m == pytest.approx(t.programme.reference(3, ns(19.0)).position_ned_m)
-    assert lost[5].other_end_ned_m == pytest.approx(t.programme.reference(5, ns(18.0)).position_ned_m)
+    assert lost[3].last_seen_ned_m == pytest.approx(t.history.reference(3, ns(19.0)).position_ned_m)
+    assert lost[5].last_seen_ned_m == pytest.approx(t.history.reference(5, ns(18.0)).position_ned_m)
     t.accept(message(sample(t, 4, 20.0)), at(20.0))
     assert not t.deaf(at(20.0))
 
@@ -893,7 +893,7 @@ def test_one_that_alone_is_silent_may_have_stopped_at_any_time() -> None:
         for vehicle in (3, 4):
             t.accept(message(sample(t, vehicle, float(second)), second), at(float(second)))
     found = predicted(t, 18.0)
-    assert found[2].other_end_ned_m == pytest.approx(t.programme.reference(2, ns(1.0)).position_ned_m)
+    assert found[2].last_seen_ned_m == pytest.approx(t.history.reference(2, ns(1.0)).position_ned_m)
     assert found[3].in_formation
     assert not t.deaf(at(18.0))
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim.network import Network, NetworkParameters
+from sim.lockstep.network import Network, NetworkParameters
 
 MESSAGES = 4000
 PERIOD_NS = 10_000_000

@@ -12,9 +12,17 @@ from hypothesis import strategies as st
 
 from companion.config import FleetConfig, load
 from companion.core.frames import Ned
-from companion.core.plan import GotoLeg, Motion, TurnLeg, VelocityLeg, over_the_pads, with_formation, with_legs
+from companion.core.trajectory import (
+    FleetTrajectory,
+    GotoLeg,
+    TurnLeg,
+    VelocityLeg,
+    over_the_pads,
+    with_formation,
+    with_legs,
+)
 from companion.errors import ConfigError, RefusedError
-from companion.operate import (
+from companion.operator.client import (
     CLOCK_ROUNDS_LEAST,
     COMMAND_LEAD_NS,
     Answers,
@@ -23,21 +31,21 @@ from companion.operate import (
     turn_leg,
     velocity_leg,
 )
-from companion.preflight import Account, Check, assignment_hash
+from companion.vehicle.preflight import Check, PreflightReport, assignment_hash
 from companion.wire.peer import decode_motion, encode_motion
 
 CONFIG = load(Path(__file__).resolve().parents[2] / "fleet.toml", lambda t: t.update(vehicle=t["vehicle"][:4]))
 NOW_NS = 1_700_000_100_000_000_000
 
 
-def formed(config: FleetConfig = CONFIG) -> Motion:
+def formed(config: FleetConfig = CONFIG) -> FleetTrajectory:
     return with_formation(
         config.first_motion, at_ns=NOW_NS - 20_000_000_000, issuer=3, shape="v", slots=config.slots("v"), pinned={},
         speed_m_s=2.0,
     )  # fmt: skip
 
 
-def status(i: int, motion: Motion, /, **more: object) -> dict[str, object]:
+def status(i: int, motion: FleetTrajectory, /, **more: object) -> dict[str, object]:
     """What a vehicle tells of itself."""
     return {
         "vehicle": i, "fleet": "starling", "up_s": 100.0 + i, "place": [100 + i, 1, 4], "phase": "formed",
@@ -51,7 +59,7 @@ def status(i: int, motion: Motion, /, **more: object) -> dict[str, object]:
 class Fleet:
     """Vehicles that hold given motions and answer as they are told to; a real Link without a network."""
 
-    motions: dict[int, Motion | None]
+    motions: dict[int, FleetTrajectory | None]
     """None: silent"""
     refusals: dict[int, str] = field(default_factory=dict)
     places: dict[int, list[int]] = field(default_factory=dict)
@@ -114,7 +122,7 @@ class Fleet:
     def account(self, i: int) -> bytes:
         vehicle = CONFIG.by_id(i)
         here = (vehicle.pad_north_m, vehicle.pad_east_m, 0.0)
-        return Account(
+        return PreflightReport(
             vehicle=i, boot_id=100 + i, system_id=i, configuration=CONFIG.shared_hash,
             assignment=assignment_hash(CONFIG), flying=False, revision=0, position_ned_m=here, slot_ned_m=here,
             origin_ned_m=here, home_altitude_amsl_m=488.0, checks=self.checks.get(i, ()),
@@ -123,7 +131,7 @@ class Fleet:
     def commands(self) -> list[bytes]:
         return [payload for _, kind, payload in self.came if kind == "command"]
 
-    def motion(self) -> Motion:
+    def motion(self) -> FleetTrajectory:
         """The one motion that everybody was sent."""
         (payload,) = set(self.commands())
         command = json.loads(payload)
@@ -131,7 +139,7 @@ class Fleet:
         return decode_motion(json.dumps(command["motion"]).encode())
 
 
-def fleet(newest: Motion | None = None) -> Fleet:
+def fleet(newest: FleetTrajectory | None = None) -> Fleet:
     return Fleet({i: newest or formed() for i in range(1, 5)})
 
 
@@ -148,7 +156,7 @@ def test_nobody_is_told_to_take_off_unless_the_whole_fleet_is_fit() -> None:
     link = fleet()
     link.motions[4] = None
     link.ahead_s[3] = 0.4
-    link.checks[2] = (Check("GF_ACTION", 4, "0 or 1", False, "GF_ACTION is 4", lasting=True, vehicle=2),)
+    link.checks[2] = (Check("GF_ACTION", 4, "0 or 1", False, "GF_ACTION is 4", permanent=True, vehicle=2),)
     with pytest.raises(PreflightError) as refused:
         Operator(CONFIG, link).take_off()
     assert link.commands() == []
@@ -157,7 +165,7 @@ def test_nobody_is_told_to_take_off_unless_the_whole_fleet_is_fit() -> None:
         "not fit for take-off:", "  not heard: vehicle 4", "  vehicle 2: GF_ACTION is 4",
         "  vehicle 3: its clock is 0.400 s from vehicle 1, 2's, may be 0.1 s",
     ]  # fmt: skip
-    assert refused.value.report.lasting
+    assert refused.value.report.permanent
 
 
 def test_a_fit_fleet_is_asked_for_its_clocks_a_few_times() -> None:
@@ -213,11 +221,11 @@ def test_hold_stops_the_centre_and_move_sends_it_on() -> None:
     link = fleet(moving)
     Operator(CONFIG, link).hold(lambda: NOW_NS)
     held = link.motion()
-    late = held.moment(NOW_NS + 30_000_000_000).centre
+    late = held.state_at(NOW_NS + 30_000_000_000).centre
     assert late.velocity == (0.0, 0.0, 0.0)
     link = fleet(held)
     Operator(CONFIG, link).move(velocity_leg(0.0, 1.0, 0.0), NOW_NS)
-    assert link.motion().moment(NOW_NS + 60_000_000_000).centre.velocity == pytest.approx((0.0, 1.0, 0.0))
+    assert link.motion().state_at(NOW_NS + 60_000_000_000).centre.velocity == pytest.approx((0.0, 1.0, 0.0))
 
 
 def test_goto_flies_the_centre_to_the_point_and_stops_there() -> None:
@@ -227,7 +235,7 @@ def test_goto_flies_the_centre_to_the_point_and_stops_there() -> None:
     (leg,) = motion.legs
     assert isinstance(leg, GotoLeg)
     assert leg.duration_s == pytest.approx(1.875 * 50.0, rel=0.01)
-    end = motion.moment((motion.end_ns or 0) + 1).centre
+    end = motion.state_at((motion.end_ns or 0) + 1).centre
     assert end.position == pytest.approx((30.0, 40.0, -10.0))
     assert end.velocity == pytest.approx((0.0, 0.0, 0.0))
     link = fleet()

@@ -11,15 +11,15 @@ from hypothesis import strategies as st
 
 from companion.core.formation import shape_slots
 from companion.core.frames import Ned
-from companion.core.plan import (
+from companion.core.trajectory import (
     BLEND_MIN_S,
     PLAN_ACCELERATION_M_S2,
     TURN_RAMP_S,
+    FleetTrajectory,
     GotoLeg,
     Leg,
-    Motion,
-    Programme,
     SlotChange,
+    TrajectoryHistory,
     TurnLeg,
     VelocityLeg,
     assignment_matches,
@@ -49,7 +49,7 @@ def ns(seconds: float) -> int:
     return START_NS + round(seconds * 1e9)
 
 
-def motion(**changed: object) -> Motion:
+def motion(**changed: object) -> FleetTrajectory:
     values: dict[str, object] = {
         "revision": 1, "start_ns": START_NS, "issuer": 0, "shape": "v",
         "slots": {1: SlotChange(Ned(0.0, 4.0, 0.0), Ned(0.0, 4.0, 0.0)), 2: SlotChange(ZERO, ZERO)},
@@ -57,7 +57,7 @@ def motion(**changed: object) -> Motion:
         "velocity_ned_m_s": ZERO, "heading_rad": 0.0, "heading_rate_rad_s": 0.0, "heading_follows_turns": False,
         "legs": (),
     }  # fmt: skip
-    return Motion(**(values | changed))  # type: ignore[arg-type]
+    return FleetTrajectory(**(values | changed))  # type: ignore[arg-type]
 
 
 motions = st.builds(
@@ -75,15 +75,17 @@ moments = st.integers(0, 10**9).map(lambda seed: random.Random(seed).uniform(0.0
 """seconds since the start, away from the round numbers at which legs meet"""
 
 
-def boundaries_s(m: Motion) -> list[float]:
+def boundaries_s(m: FleetTrajectory) -> list[float]:
     """Times since the start at which a leg ends."""
     times = [0.0]
     for leg in m.legs:
-        times.append(times[-1] + leg_duration_s(leg, m.moment(ns(times[-1])).centre.velocity))
+        times.append(times[-1] + leg_duration_s(leg, m.state_at(ns(times[-1])).centre.velocity))
     return times[1:]
 
 
-def assert_continues(before: Motion, after: Motion, t_s: float, vehicle: int, *, velocity: bool = True) -> None:
+def assert_continues(
+    before: FleetTrajectory, after: FleetTrajectory, t_s: float, vehicle: int, *, velocity: bool = True
+) -> None:
     a, b = before.reference(vehicle, ns(t_s)), after.reference(vehicle, ns(t_s))
     assert dist(a.position_ned_m, b.position_ned_m) < 1e-6
     assert abs(sin(0.5 * (a.heading_rad - b.heading_rad))) < 1e-9
@@ -93,7 +95,7 @@ def assert_continues(before: Motion, after: Motion, t_s: float, vehicle: int, *,
 
 @settings(deadline=None, max_examples=100)
 @given(motions, moments)
-def test_velocity_and_acceleration_are_the_derivatives(m: Motion, t_s: float) -> None:
+def test_velocity_and_acceleration_are_the_derivatives(m: FleetTrajectory, t_s: float) -> None:
     h = 1e-4
     earlier, now, later = (m.reference(1, ns(t)) for t in (t_s - h, t_s, t_s + h))
     for k in range(3):
@@ -104,12 +106,12 @@ def test_velocity_and_acceleration_are_the_derivatives(m: Motion, t_s: float) ->
             now.acceleration_ned_m_s2[k], abs=2e-4
         )
     turned = atan2(sin(later.heading_rad - earlier.heading_rad), cos(later.heading_rad - earlier.heading_rad))
-    assert turned / (2 * h) == pytest.approx(m.moment(ns(t_s)).rate, abs=1e-4)
+    assert turned / (2 * h) == pytest.approx(m.state_at(ns(t_s)).rate, abs=1e-4)
 
 
 @PROPERTY
 @given(motions)
-def test_legs_and_blends_meet_without_a_jump(m: Motion) -> None:
+def test_legs_and_blends_meet_without_a_jump(m: FleetTrajectory) -> None:
     for t in [*boundaries_s(m), m.blend_s, TURN_RAMP_S]:
         before, after = m.reference(1, ns(t) - 20), m.reference(1, ns(t) + 20)
         assert dist(before.position_ned_m, after.position_ned_m) < 1e-5
@@ -118,7 +120,9 @@ def test_legs_and_blends_meet_without_a_jump(m: Motion) -> None:
 
 @PROPERTY
 @given(motions, moments, st.lists(legs, max_size=2), st.sampled_from([None, True, False]))
-def test_other_legs_take_over_without_a_jump(m: Motion, t_s: float, new: list[Leg], follows: bool | None) -> None:
+def test_other_legs_take_over_without_a_jump(
+    m: FleetTrajectory, t_s: float, new: list[Leg], follows: bool | None
+) -> None:
     after = with_legs(m, at_ns=ns(t_s), issuer=3, legs=tuple(new), heading_follows_turns=follows)
     assert (after.revision, after.start_ns, after.issuer) == (m.revision + 1, ns(t_s), 3)
     assert after.order > m.order
@@ -127,14 +131,14 @@ def test_other_legs_take_over_without_a_jump(m: Motion, t_s: float, new: list[Le
 
 @PROPERTY
 @given(motions, st.floats(0.0, 30.0), st.sampled_from(["line", "circle", "column", "spiral"]))
-def test_another_formation_takes_over_without_a_jump(m: Motion, wait_s: float, shape: str) -> None:
+def test_another_formation_takes_over_without_a_jump(m: FleetTrajectory, wait_s: float, shape: str) -> None:
     slots = shape_slots(shape, len(m.slots), 4.0)
     t_s = m.blend_s + wait_s
     after = with_formation(m, at_ns=ns(t_s), issuer=3, shape=shape, slots=slots, pinned={}, speed_m_s=1.0)
     assert_continues(m, after, t_s, 1)
     assert after.order > m.order
     end = after.blend_end_ns
-    own = after.moment(end).slot(SlotChange(ZERO, ZERO)).position_ned_m
+    own = after.state_at(end).slot(SlotChange(ZERO, ZERO)).position_ned_m
     assert dist(after.reference(1, end).position_ned_m, own) == pytest.approx(dist(slots[0], ZERO), abs=1e-6)
 
 
@@ -158,17 +162,17 @@ def test_a_velocity_leg_arrives_within_its_acceleration(v0: Ned, v1: Ned, durati
     m = motion(velocity_ned_m_s=v0, legs=(leg,))
     whole = leg_duration_s(leg, v0)
     assert whole >= duration_s
-    assert m.moment(ns(whole + 1e-3)).centre.velocity == pytest.approx(v1, abs=1e-6)
-    assert m.moment(ns(whole + 50.0)).centre.velocity == pytest.approx(v1, abs=1e-9)
-    peak = max(hypot(*m.moment(ns(whole * k / 200)).centre.acceleration) for k in range(201))
+    assert m.state_at(ns(whole + 1e-3)).centre.velocity == pytest.approx(v1, abs=1e-6)
+    assert m.state_at(ns(whole + 50.0)).centre.velocity == pytest.approx(v1, abs=1e-9)
+    peak = max(hypot(*m.state_at(ns(whole * k / 200)).centre.acceleration) for k in range(201))
     assert peak <= PLAN_ACCELERATION_M_S2 + 1e-9
 
 
 def test_a_leg_of_zero_velocity_holds_the_place() -> None:
     m = motion(velocity_ned_m_s=Ned(1.0, 0.0, 0.0), legs=(VelocityLeg(ZERO, 0.0),))
-    stop = m.moment(ns(3.0)).centre
+    stop = m.state_at(ns(3.0)).centre
     assert stop.velocity == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)
-    assert m.moment(ns(1000.0)).centre.position == pytest.approx(stop.position, abs=1e-9)
+    assert m.state_at(ns(1000.0)).centre.position == pytest.approx(stop.position, abs=1e-9)
 
 
 @PROPERTY
@@ -177,11 +181,11 @@ def test_a_turn_keeps_the_speed_and_turns_by_its_angle(v0: Ned, rate: float, ang
     m = motion(velocity_ned_m_s=v0, legs=(TurnLeg(rate, angle),), heading_follows_turns=True)
     whole = leg_duration_s(m.legs[0], v0)
     for k in range(21):
-        v = m.moment(ns(whole * k / 20)).centre.velocity
+        v = m.state_at(ns(whole * k / 20)).centre.velocity
         assert hypot(v.north, v.east) == pytest.approx(hypot(v0.north, v0.east), abs=1e-9)
         assert v.down == v0.down
-        assert abs(m.moment(ns(whole * k / 20)).rate) <= abs(rate) + 1e-12
-    end = m.moment(ns(whole + 1.0))
+        assert abs(m.state_at(ns(whole * k / 20)).rate) <= abs(rate) + 1e-12
+    end = m.state_at(ns(whole + 1.0))
     signed = angle if rate > 0 else -angle
     assert sin(0.5 * (end.heading_rad - signed)) == pytest.approx(0.0, abs=1e-9)
     c, s = cos(signed), sin(signed)
@@ -203,8 +207,8 @@ def test_a_turns_place_is_the_integral_of_its_velocity(v0: Ned, rate: float, ang
     for a, b in pairwise(pieces):
         for x, w in zip(nodes, weights, strict=True):
             t = 0.5 * (a + b) + 0.5 * (b - a) * x
-            place = place + 0.5 * (b - a) * w * np.array(m.moment(ns(t)).centre.velocity)
-    assert m.moment(ns(end)).centre.position == pytest.approx(tuple(place), abs=1e-6)
+            place = place + 0.5 * (b - a) * w * np.array(m.state_at(ns(t)).centre.velocity)
+    assert m.state_at(ns(end)).centre.position == pytest.approx(tuple(place), abs=1e-6)
 
 
 @pytest.mark.parametrize("angle", [1e-4, 0.02, 0.29, 0.3, 0.31, 2.0])
@@ -212,24 +216,24 @@ def test_a_small_turn_is_as_gentle_as_a_large_one(angle: float) -> None:
     """A formation 15 m wide that turns by a degree must not be jerked round."""
     m = motion(velocity_ned_m_s=Ned(1.0, 0.0, 0.0), legs=(TurnLeg(0.1, angle),), heading_follows_turns=True)
     whole = leg_duration_s(m.legs[0], m.velocity_ned_m_s)
-    moments = [m.moment(ns(whole * k / 200)) for k in range(201)]
+    moments = [m.state_at(ns(whole * k / 200)) for k in range(201)]
     assert max(abs(x.rate_change) for x in moments) <= 1.5 * 0.1 / TURN_RAMP_S + 1e-9
     assert max(abs(x.rate) for x in moments) <= 0.1 + 1e-12
 
 
 def test_a_turn_to_the_right_is_clockwise_seen_from_above() -> None:
     m = motion(velocity_ned_m_s=Ned(1.0, 0.0, 0.0), legs=(TurnLeg(0.1, pi / 2),))
-    assert m.moment(ns(100.0)).centre.velocity == pytest.approx((0.0, 1.0, 0.0), abs=1e-9)
+    assert m.state_at(ns(100.0)).centre.velocity == pytest.approx((0.0, 1.0, 0.0), abs=1e-9)
 
 
 def test_an_endless_turn_is_a_circle_for_hours() -> None:
     m = motion(velocity_ned_m_s=Ned(1.0, 0.0, 0.0), legs=(TurnLeg(-0.1, inf),), heading_follows_turns=True)
     assert m.end_ns is None
     lap = 2 * pi / 0.1
-    first = m.moment(ns(10.0)).centre.position
+    first = m.state_at(ns(10.0)).centre.position
     for laps in (1, 57, 570):
-        assert dist(m.moment(ns(10.0 + laps * lap)).centre.position, first) < 1e-4
-    across = m.moment(ns(10.0 + lap / 2)).centre.position
+        assert dist(m.state_at(ns(10.0 + laps * lap)).centre.position, first) < 1e-4
+    across = m.state_at(ns(10.0 + lap / 2)).centre.position
     assert dist(first, across) == pytest.approx(20.0, abs=1e-6)
 
 
@@ -239,7 +243,7 @@ def test_slots_turn_with_the_heading_only_if_it_follows() -> None:
     following = motion(velocity_ned_m_s=Ned(1.0, 0.0, 0.0), legs=turn, heading_follows_turns=True)
     for m, sign in ((fixed, 1.0), (following, -1.0)):
         t = ns(100.0)
-        centre, slot = m.moment(t).centre.position, m.reference(1, t).position_ned_m
+        centre, slot = m.state_at(t).centre.position, m.reference(1, t).position_ned_m
         assert slot.east - centre.east == pytest.approx(sign * 4.0)
 
 
@@ -248,7 +252,7 @@ def test_slots_turn_with_the_heading_only_if_it_follows() -> None:
 def test_a_goto_leg_ends_at_its_target_at_rest(start: Ned, v0: Ned, target: Ned, duration_s: float) -> None:
     m = motion(centre_ned_m=start, velocity_ned_m_s=v0, legs=(GotoLeg(target, duration_s),))
     for wait in (0.0, 1.0, 500.0):
-        end = m.moment(ns(duration_s + wait)).centre
+        end = m.state_at(ns(duration_s + wait)).centre
         assert end.position == pytest.approx(target, abs=1e-6)
         assert end.velocity == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
 
@@ -258,7 +262,7 @@ def test_a_goto_leg_ends_at_its_target_at_rest(start: Ned, v0: Ned, target: Ned,
 def test_goto_durations_keep_speed_and_acceleration(start: Ned, target: Ned, speed: float) -> None:
     whole = goto_duration_s(Ned(*(b - a for a, b in zip(start, target, strict=True))), ZERO, speed)
     m = motion(centre_ned_m=start, legs=(GotoLeg(target, whole),))
-    centres = [m.moment(ns(whole * k / 200)).centre for k in range(201)]
+    centres = [m.state_at(ns(whole * k / 200)).centre for k in range(201)]
     assert max(hypot(*c.velocity) for c in centres) <= speed * (1 + 1e-6)
     assert max(hypot(*c.acceleration) for c in centres) <= 2 * PLAN_ACCELERATION_M_S2 * (1 + 1e-4)
 
@@ -332,16 +336,16 @@ def test_an_assignment_that_is_not_ours_is_told_apart() -> None:
 orders = st.tuples(st.integers(1, 4), st.integers(0, 3), st.integers(0, 3))
 
 
-def proposal(order: tuple[int, int, int]) -> Motion:
+def proposal(order: tuple[int, int, int]) -> FleetTrajectory:
     revision, start_s, issuer = order
     return motion(revision=revision, start_ns=ns(float(start_s)), issuer=issuer, centre_ned_m=Ned(*map(float, order)))
 
 
-def after_adopting(found: list[tuple[int, int, int]]) -> Programme:
-    programme = Programme([motion(revision=0)])
+def after_adopting(found: list[tuple[int, int, int]]) -> TrajectoryHistory:
+    history = TrajectoryHistory([motion(revision=0)])
     for order in found:
-        programme.adopt(proposal(order))
-    return programme
+        history.adopt(proposal(order))
+    return history
 
 
 @PROPERTY
@@ -365,15 +369,15 @@ def test_a_programmes_motions_ascend_and_are_few(found: list[tuple[int, int, int
 
 
 def test_adopting_says_whether_something_changed() -> None:
-    programme = Programme([motion(revision=0)])
-    assert programme.adopt(proposal((1, 2, 3)))
-    assert not programme.adopt(proposal((1, 2, 3)))
-    assert not programme.adopt(proposal((1, 2, 2)))
-    assert not programme.adopt(proposal((1, 3, 9)))
-    assert programme.adopt(proposal((1, 2, 4)))
-    assert programme.adopt(proposal((1, 1, 0)))
-    assert programme.adopt(proposal((2, 9, 0)))
-    assert not programme.adopt(proposal((1, 9, 9)))
+    history = TrajectoryHistory([motion(revision=0)])
+    assert history.adopt(proposal((1, 2, 3)))
+    assert not history.adopt(proposal((1, 2, 3)))
+    assert not history.adopt(proposal((1, 2, 2)))
+    assert not history.adopt(proposal((1, 3, 9)))
+    assert history.adopt(proposal((1, 2, 4)))
+    assert history.adopt(proposal((1, 1, 0)))
+    assert history.adopt(proposal((2, 9, 0)))
+    assert not history.adopt(proposal((1, 9, 9)))
 
 
 def test_two_proposals_for_one_revision_leave_one() -> None:
@@ -382,18 +386,18 @@ def test_two_proposals_for_one_revision_leave_one() -> None:
 
 
 def test_a_motion_is_in_force_from_its_start_on() -> None:
-    programme = after_adopting([(1, 1, 0), (2, 3, 0)])
+    history = after_adopting([(1, 1, 0), (2, 3, 0)])
     for t_s, revision in ((-5.0, 0), (0.0, 0), (0.999999999, 0), (1.0, 1), (2.999999999, 1), (3.0, 2), (50.0, 2)):
-        assert programme.at(ns(t_s)).revision == revision
+        assert history.at(ns(t_s)).revision == revision
 
 
 def test_a_vehicle_flies_from_one_motion_into_the_next_without_a_step() -> None:
     first = motion(velocity_ned_m_s=Ned(1.0, 0.0, 0.0), legs=(TurnLeg(0.2, inf),), heading_follows_turns=True)
-    programme = Programme([first])
+    history = TrajectoryHistory([first])
     at_ns = ns(11.3)
-    programme.adopt(with_legs(first, at_ns=at_ns, issuer=1, legs=(GotoLeg(ZERO, 30.0),)))
+    history.adopt(with_legs(first, at_ns=at_ns, issuer=1, legs=(GotoLeg(ZERO, 30.0),)))
     for vehicle in (1, 2):
-        before, after = programme.reference(vehicle, at_ns - 1), programme.reference(vehicle, at_ns)
+        before, after = history.reference(vehicle, at_ns - 1), history.reference(vehicle, at_ns)
         assert dist(before.position_ned_m, after.position_ned_m) < 1e-6
         assert dist(before.velocity_ned_m_s, after.velocity_ned_m_s) < 1e-6
 

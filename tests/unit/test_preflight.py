@@ -9,11 +9,11 @@ import pytest
 
 from companion.config import FleetConfig, load
 from companion.core.frames import Ned, ned_to_geodetic
-from companion.preflight import (
+from companion.vehicle.preflight import (
     PARAMETERS,
-    Account,
     AutopilotFacts,
     Check,
+    PreflightReport,
     assignment_hash,
     own_checks,
     parameter_rules,
@@ -47,7 +47,7 @@ FIT = AutopilotFacts(
 
 
 def faults(facts: AutopilotFacts, of: FleetConfig = CONFIG, place: Ned | None = PAD) -> list[str]:
-    return [c.says for c in unmet(own_checks(facts, of, of.vehicles[0], place))]
+    return [c.message for c in unmet(own_checks(facts, of, of.vehicles[0], place))]
 
 
 def test_a_fit_vehicle_meets_every_row_and_each_row_names_it() -> None:
@@ -220,25 +220,25 @@ def test_of_an_autopilot_that_is_no_px4_no_parameter_is_wanted() -> None:
 
 
 def test_only_what_waiting_may_heal_is_waited_for() -> None:
-    def lasting(facts: AutopilotFacts) -> bool:
+    def permanent(facts: AutopilotFacts) -> bool:
         (row,) = unmet(own_checks(facts, CONFIG, CONFIG.vehicles[0], PAD))
-        return row.lasting
+        return row.permanent
 
-    assert lasting(replace(FIT, parameters={**FIT_PARAMETERS, "GF_ACTION": 4}))
-    assert lasting(replace(FIT, battery_percent=10))
-    assert lasting(replace(FIT, autopilot_kind=3))
-    assert not lasting(replace(FIT, estimator_flags=0))
-    assert not lasting(replace(FIT, position_rate_hz=1.0))
-    assert not lasting(replace(FIT, parameters={}))
+    assert permanent(replace(FIT, parameters={**FIT_PARAMETERS, "GF_ACTION": 4}))
+    assert permanent(replace(FIT, battery_percent=10))
+    assert permanent(replace(FIT, autopilot_kind=3))
+    assert not permanent(replace(FIT, estimator_flags=0))
+    assert not permanent(replace(FIT, position_rate_hz=1.0))
+    assert not permanent(replace(FIT, parameters={}))
 
 
 def test_an_account_survives_its_journey() -> None:
     rows = own_checks(replace(FIT, position_age_s=float("inf"), round_trip_s=None), CONFIG, CONFIG.vehicles[0], PAD)
-    account = Account(
+    account = PreflightReport(
         vehicle=1, boot_id=7, system_id=1, configuration="c", assignment="a", flying=False, revision=0,
         position_ned_m=PAD, slot_ned_m=PAD, origin_ned_m=None, home_altitude_amsl_m=None, checks=rows,
     )  # fmt: skip
-    again = Account.model_validate_json(account.model_dump_json())
+    again = PreflightReport.model_validate_json(account.model_dump_json())
     assert again == account
     assert isinstance(again.checks[0], Check)
 

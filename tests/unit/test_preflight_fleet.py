@@ -9,14 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.config import FleetConfig, load
-from companion.preflight import Account, Check, assignment_hash, first_formation
-from companion.preflight_fleet import (
+from companion.operator.preflight import (
     ClockOffset,
     Report,
     best_offset,
     change_distances_m,
     fleet_report,
 )
+from companion.vehicle.preflight import Check, PreflightReport, assignment_hash, first_formation
 
 FILE = Path(__file__).resolve().parents[2] / "fleet.toml"
 
@@ -33,7 +33,7 @@ def config(count: int = 3, **tables: Any) -> FleetConfig:
 CONFIG = config()
 
 
-def account(i: int, of: FleetConfig = CONFIG, **more: Any) -> Account:
+def account(i: int, of: FleetConfig = CONFIG, **more: Any) -> PreflightReport:
     v = of.by_id(i)
     here = (v.pad_north_m, v.pad_east_m, 0.0)
     facts: dict[str, Any] = {
@@ -42,23 +42,25 @@ def account(i: int, of: FleetConfig = CONFIG, **more: Any) -> Account:
         "slot_ned_m": (here[0], here[1], -10.0), "origin_ned_m": (1.0, 2.0, 0.0), "home_altitude_amsl_m": 488.0,
         "checks": (), **more,
     }  # fmt: skip
-    return Account(**facts)
+    return PreflightReport(**facts)
 
 
 def report(
-    changed: dict[int, Account | None] | None = None,
+    changed: dict[int, PreflightReport | None] | None = None,
     *,
     of: FleetConfig = CONFIG,
     offsets: dict[int, ClockOffset | None] | None = None,
     boots: dict[int, frozenset[int]] | None = None,
 ) -> Report:
     ids = [v.id for v in of.vehicles]
-    accounts: dict[int, Account | None] = {i: account(i, of) for i in ids} | (changed or {})
+    accounts: dict[int, PreflightReport | None] = {i: account(i, of) for i in ids} | (changed or {})
     clocks: dict[int, ClockOffset | None] = {i: ClockOffset(0.0, 0.001) for i in ids}
     return fleet_report(of, accounts, clocks | (offsets or {}), boots or {})
 
 
-def shifted(i: int, north: float = 0.0, east: float = 0.0, up: float = 0.0, of: FleetConfig = CONFIG) -> Account:
+def shifted(
+    i: int, north: float = 0.0, east: float = 0.0, up: float = 0.0, of: FleetConfig = CONFIG
+) -> PreflightReport:
     v = of.by_id(i)
     return account(i, of, position_ned_m=(v.pad_north_m + north, v.pad_east_m + east, -up))
 
@@ -71,15 +73,15 @@ def test_a_fleet_of_one_mind_is_fit() -> None:
 
 def test_who_is_not_heard_is_named() -> None:
     assert report({2: None}).faults == ["not heard: vehicle 2"]
-    assert not report({2: None}).lasting
+    assert not report({2: None}).permanent
     assert "not heard: vehicle 1, 2, 3" in report({1: None, 2: None, 3: None}).faults
 
 
 def test_each_vehicles_own_faults_are_told_with_its_id() -> None:
-    row = Check("battery", 12, ">= 30 %", False, "battery at 12 %, must have 30 %", lasting=True, vehicle=2)
+    row = Check("battery", 12, ">= 30 %", False, "battery at 12 %, must have 30 %", permanent=True, vehicle=2)
     told = report({2: account(2, checks=(row,))})
     assert told.faults == ["vehicle 2: battery at 12 %, must have 30 %"]
-    assert told.lasting
+    assert told.permanent
 
 
 def test_ids_that_are_not_the_vehicles_own_are_named() -> None:
@@ -197,7 +199,7 @@ def test_nobody_starts_under_one_that_flies(gap_m: float, fit: bool) -> None:
     limit = f"{CONFIG.safety_radius_m:.2f} m"
     expected = [f"vehicle 2 flies {level_m:.2f} m from over vehicle 1's start; must be {limit}"]
     assert told.faults == ([] if fit else expected)
-    assert not told.lasting, "it may fly on"
+    assert not told.permanent, "it may fly on"
 
 
 def test_whoever_flies_is_no_start_under_another() -> None:
@@ -236,7 +238,7 @@ def test_vehicles_on_each_others_pads_cross() -> None:
     told = report({1: shifted(1, east=apart), 2: shifted(2, east=-apart)})
     assert len(told.faults) == 1
     assert told.faults[0].startswith("ways of vehicle 1 and 2 from where they stand come within 0.00 m")
-    assert told.lasting
+    assert told.permanent
 
 
 def test_ways_that_cross_like_an_x_are_found() -> None:
@@ -295,7 +297,7 @@ def test_the_least_distance_is_that_of_the_flown_blend(angle: float, count: int)
     steps = 400
     seen = dict.fromkeys(exact, float("inf"))
     for k in range(steps + 1):
-        moment = motion.moment(motion.blend_start_ns + round(motion.blend_s * 1e9 * k / steps))
+        moment = motion.state_at(motion.blend_start_ns + round(motion.blend_s * 1e9 * k / steps))
         at = {i: moment.slot(change).position_ned_m for i, change in motion.slots.items()}
         for i, j in seen:
             d = sum((a - b) ** 2 for a, b in zip(at[i], at[j], strict=True)) ** 0.5
@@ -307,7 +309,7 @@ def test_the_least_distance_is_that_of_the_flown_blend(angle: float, count: int)
 
 def test_formation_and_plan_have_rows_with_their_figures() -> None:
     rows = {c.name: c for c in report().checks}
-    assert rows["slots"].met
+    assert rows["slots"].passed
     assert rows["lowest slot"].value == pytest.approx(10.0)
     assert rows["plan's speed"].value == pytest.approx(1.0, abs=0.01)
     assert rows["plan's speed"].limit == "<= 3 m/s"

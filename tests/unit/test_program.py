@@ -11,10 +11,10 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from companion.core.fence import Fence, braking_pole_per_s, wall_plane
 from companion.core.frames import Ned
-from companion.core.program import FLAT, Solution, solve
-from companion.core.safety import SafetyFilter, SafetyLimits, half_plane, sidestep
+from companion.core.safety.fence import Fence, braking_pole_per_s, wall_plane
+from companion.core.safety.filter import SafetyFilter, SafetyLimits, half_plane, sidestep
+from companion.core.safety.program import FLAT, Solution, solve
 from companion.core.values import Command, Neighbour, VehicleState
 
 Point = tuple[float, float]
@@ -255,7 +255,7 @@ def judge_filter(rng: random.Random, most_peers: int) -> str:
     neighbours = [
         n._replace(
             position_ned_m=moved(place, n.position_ned_m),
-            other_end_ned_m=None if n.other_end_ned_m is None else moved(place, n.other_end_ned_m),
+            last_seen_ned_m=None if n.last_seen_ned_m is None else moved(place, n.last_seen_ned_m),
         )
         for n in neighbours
     ]

@@ -3,8 +3,8 @@
 import pytest
 
 from companion.core.frames import Ned
-from companion.core.plan import Reference
-from companion.core.rejoin import OwnWay
+from companion.core.rejoin import RejoinTrajectory
+from companion.core.trajectory import Reference
 
 ZERO = Ned(0.0, 0.0, 0.0)
 SECOND = 1_000_000_000
@@ -16,13 +16,13 @@ def slot(fleet_ns: int) -> Reference:
 
 
 def test_it_stands_until_it_sets_out() -> None:
-    way = OwnWay(Ned(3.0, 4.0, -8.0))
+    way = RejoinTrajectory(Ned(3.0, 4.0, -8.0))
     assert way.reference(slot(9 * SECOND), 9 * SECOND) == Reference(Ned(3.0, 4.0, -8.0), ZERO, ZERO, 0.0)
     assert not way.over(10**18)
 
 
 def test_position_velocity_and_acceleration_go_on_smoothly_from_standing_to_the_moving_slot() -> None:
-    way = OwnWay(Ned(3.0, 4.0, -8.0))
+    way = RejoinTrajectory(Ned(3.0, 4.0, -8.0))
     way.come_back(slot(0), way.reference(slot(0), 0), 0, 2.0)
     begin = way.reference(slot(0), 0)
     assert begin.position_ned_m == pytest.approx((3.0, 4.0, -8.0))

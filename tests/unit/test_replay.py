@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
-from companion.agent import Agent
 from companion.config import load
 from companion.core.values import Instant
 from companion.io.recorder import Entry
-from companion.replay import replay
+from companion.io.replay import replay
+from companion.vehicle.agent import Agent
 
 CONFIG = load(Path(__file__).resolve().parents[2] / "fleet.toml")
 START = Instant(0, 1_700_000_000_000_000_000)

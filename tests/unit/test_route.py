@@ -9,11 +9,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.core.fence import Fence
 from companion.core.formation import shape_slots
 from companion.core.frames import Ned
-from companion.core.plan import GotoLeg, Leg, Motion, SlotChange, TurnLeg, VelocityLeg, with_formation, with_legs
 from companion.core.route import RESOLUTION_M, first_breach, only_stops
+from companion.core.safety.fence import Fence
+from companion.core.trajectory import (
+    FleetTrajectory,
+    GotoLeg,
+    Leg,
+    SlotChange,
+    TurnLeg,
+    VelocityLeg,
+    with_formation,
+    with_legs,
+)
 from companion.core.values import ZERO
 
 NEAR_M = 0.25
@@ -28,20 +37,20 @@ OCTAGON = Fence(
 )
 
 
-def motion(*legs: Leg, count: int = 5, shape: str = "v", velocity: Ned = ZERO, follow: bool = False) -> Motion:
+def motion(*legs: Leg, count: int = 5, shape: str = "v", velocity: Ned = ZERO, follow: bool = False) -> FleetTrajectory:
     slots = shape_slots(shape, count, 4.0)
-    return Motion(
+    return FleetTrajectory(
         revision=1, start_ns=0, issuer=0, shape=shape, slots={k + 1: SlotChange(s, s) for k, s in enumerate(slots)},
         blend_start_ns=0, blend_s=0.0, legs_start_ns=0, centre_ned_m=Ned(0.0, 0.0, -10.0), velocity_ned_m_s=velocity,
         heading_rad=0.0, heading_rate_rad_s=0.0, heading_follows_turns=follow, legs=legs,
     )  # fmt: skip
 
 
-def alone(*legs: Leg, velocity: Ned = ZERO) -> Motion:
+def alone(*legs: Leg, velocity: Ned = ZERO) -> FleetTrajectory:
     return motion(*legs, count=1, velocity=velocity)
 
 
-def sampled_worst(m: Motion, fence: Fence, end_s: float) -> float:
+def sampled_worst(m: FleetTrajectory, fence: Fence, end_s: float) -> float:
     """The least room of any slot, looked at 20 times a second."""
     return min(
         fence.room_m(m.reference(i, round(k * 5e7)).position_ned_m) for k in range(int(end_s * 20) + 1) for i in m.slots
@@ -140,7 +149,7 @@ def test_a_change_of_formation_near_the_edge_is_refused_before_any_leg() -> None
 def test_a_way_back_is_taken_though_the_formation_first_drifts_further_out() -> None:
     drifting = replace(alone(velocity=Ned(1.5, 0.0, 0.0)), centre_ned_m=Ned(60.0, 0.0, -10.0))
     back = with_legs(drifting, at_ns=0, issuer=0, legs=(GotoLeg(Ned(0.0, 0.0, -10.0), 60.0),))
-    assert back.moment(5 * 10**9).centre.position.north > 63.0
+    assert back.state_at(5 * 10**9).centre.position.north > 63.0
     assert first_breach(back, FENCE) is None
     away = with_legs(drifting, at_ns=0, issuer=0, legs=(VelocityLeg(Ned(1.0, 0.0, 0.0), 5.0),))
     assert first_breach(away, FENCE) is not None

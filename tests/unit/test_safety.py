@@ -12,8 +12,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from companion.core.frames import Ned
-from companion.core.program import solve
-from companion.core.safety import (
+from companion.core.safety.filter import (
     COLLISION_DISTANCE_M,
     DOWNWASH_RATIO,
     LAG_ALLOWANCE_M,
@@ -27,6 +26,7 @@ from companion.core.safety import (
     safety_radius_m,
     sidestep,
 )
+from companion.core.safety.program import solve
 from companion.core.values import Command, Neighbour, SafeSetpoint, VehicleState
 
 PROPERTY = settings(deadline=None, max_examples=60)
@@ -159,7 +159,7 @@ def test_a_half_plane_of_a_wall_is_nobodys_and_stands() -> None:
 
 
 def test_a_half_plane_tells_the_obstacles_velocity() -> None:
-    drifting = peer(Ned(3.0, -1.0, 0.0), Ned(0.0, 0.4, 0.3), other_end_ned_m=Ned(3.0, 1.0, 0.0))
+    drifting = peer(Ned(3.0, -1.0, 0.0), Ned(0.0, 0.4, 0.3), last_seen_ned_m=Ned(3.0, 1.0, 0.0))
     assert half_plane(state(), ZERO, drifting)[4:] == pytest.approx((0.0, 0.2))
     assert half_plane(state(), ZERO, peer(Ned(3.0, -1.0, 0.0), Ned(1.0, 0.4, 0.3)))[4:] == (1.0, 0.4)
 
@@ -188,7 +188,7 @@ def test_vertical_distance_counts_less_by_the_downwash() -> None:
 @PROPERTY
 @given(vectors, vectors, vectors, vectors)
 def test_the_nearest_place_of_a_lost_peer_is_the_nearest_of_its_segment(ego: Ned, a: Ned, b: Ned, v: Ned) -> None:
-    place, velocity = nearest_hypothesis(ego, peer(a, v, other_end_ned_m=b))
+    place, velocity = nearest_hypothesis(ego, peer(a, v, last_seen_ned_m=b))
     shares = np.linspace(0.0, 1.0, 401)
     scale = np.array([1.0, 1.0, 1.0 / DOWNWASH_RATIO])  # the ellipsoid's measure
     segment = (1 - shares)[:, None] * np.array(a) + shares[:, None] * np.array(b)
@@ -203,7 +203,7 @@ def test_the_nearest_place_of_a_lost_peer_is_the_nearest_of_its_segment(ego: Ned
 def test_flying_along_a_lost_peers_segment_carries_nobody_away_from_it(ego: Ned, v: Ned, u: Ned) -> None:
     """Beside the segment only the motion across it counts: the barrier is that of a wall."""
     beside = Ned(ego.north, 0.5 + abs(ego.east), 0.0)
-    n = peer(Ned(20.0, 0.0, 0.0), other_end_ned_m=Ned(-20.0, 0.0, 0.0))
+    n = peer(Ned(20.0, 0.0, 0.0), last_seen_ned_m=Ned(-20.0, 0.0, 0.0))
     plane = half_plane(state(beside, v), ZERO, n)
     wall = barrier_condition(
         state(Ned(0.0, beside.east, 0.0), Ned(0.0, v.east, 0.0)), peer(ZERO), Ned(0.0, u.east, 0.0), ZERO
@@ -231,20 +231,20 @@ def test_beside_a_slanted_segment_the_barrier_is_that_of_its_line(p: Ned, v: Ned
     h0, h1, h2 = (float(across(t) @ across(t)) - 1.0 for t in (0.0, step, -step))
     whole = (h1 + h2 - 2 * h0) / step**2 + 5.0 * (h1 - h2) / (2 * step) + 6.25 * h0
     whole /= 2.0 * max(sqrt(h0 + 1.0), COLLISION_DISTANCE_M)
-    plane = half_plane(state(p, v), ZERO, peer(a, other_end_ned_m=b))
+    plane = half_plane(state(p, v), ZERO, peer(a, last_seen_ned_m=b))
     assert plane.g_north * u.north + plane.g_east * u.east - plane.b == pytest.approx(whole, abs=1e-3, rel=1e-4)
 
 
 @pytest.mark.parametrize(("north", "end", "moves"), [(21.0, 20.0, 0.5), (-21.0, -20.0, 0.0)])
 def test_beyond_its_ends_a_lost_peers_segment_is_the_place_of_the_end(north: float, end: float, moves: float) -> None:
     ego = state(Ned(north, 0.4, 0.0), Ned(-1.0, 0.3, 0.0))
-    lost = peer(Ned(20.0, 0.0, 0.0), Ned(0.5, 0.0, 0.0), other_end_ned_m=Ned(-20.0, 0.0, 0.0))
+    lost = peer(Ned(20.0, 0.0, 0.0), Ned(0.5, 0.0, 0.0), last_seen_ned_m=Ned(-20.0, 0.0, 0.0))
     assert half_plane(ego, ZERO, lost) == half_plane(ego, ZERO, peer(Ned(end, 0.0, 0.0), Ned(moves, 0.0, 0.0)))
 
 
 def test_a_lost_peer_whose_ends_meet_has_one_place() -> None:
     a = Ned(1.0, 2.0, 3.0)
-    assert nearest_hypothesis(ZERO, peer(a, Ned(1.0, 0.0, 0.0), other_end_ned_m=a)) == (a, (1.0, 0.0, 0.0))
+    assert nearest_hypothesis(ZERO, peer(a, Ned(1.0, 0.0, 0.0), last_seen_ned_m=a)) == (a, (1.0, 0.0, 0.0))
 
 
 @pytest.mark.parametrize("uncertainty", [0.0, 0.35, 1.0])
@@ -312,7 +312,7 @@ def test_leaving_out_what_is_out_of_reach_changes_no_setpoint(
     for k, (r, a, v, w) in enumerate(crowd):
         place = Ned(r * cos(a), r * sin(a), 0.0)
         near.append(peer(place, Ned(v, w, 0.0), vehicle_id=k + 2, shares=shares))
-        lines.append(near[-1]._replace(other_end_ned_m=place))
+        lines.append(near[-1]._replace(last_seen_ned_m=place))
     assert applied(quick, command(Ned(*u, 0.0)), state(), near) == applied(full, command(Ned(*u, 0.0)), state(), lines)
     assert quick.counts == full.counts
 
@@ -418,7 +418,7 @@ def test_a_peer_that_is_not_finite_makes_it_brake_and_the_others_are_kept_apart_
         broken if field == "position" else Ned(9.0, 0.0, 0.0),
         broken if field == "velocity" else ZERO,
         uncertainty_m=bad if field == "uncertainty" else 0.35,
-        other_end_ned_m=broken if field == "other end" else None,
+        last_seen_ned_m=broken if field == "other end" else None,
         shares=field == "reference",
         reference_acceleration_ned_m_s2=broken if field == "reference" else ZERO,
     )
@@ -696,7 +696,7 @@ def test_a_blocked_vehicle_is_moved_along_the_obstacle_to_its_right(
         (peer(Ned(1.3, 0.0, 0.0), Ned(0.0, -0.3, 0.0)), 0.45),
         (peer(Ned(1.3, 0.0, 0.0), Ned(0.0, -0.6, 0.0)), 0.0),
         # Lost, the one end drifting: its middle moves half as fast.
-        (peer(Ned(1.3, -1.0, 0.0), Ned(0.0, 0.4, 0.0), other_end_ned_m=Ned(1.3, 1.0, 0.0)), 1.2),
+        (peer(Ned(1.3, -1.0, 0.0), Ned(0.0, 0.4, 0.0), last_seen_ned_m=Ned(1.3, 1.0, 0.0)), 1.2),
     ],
 )
 @pytest.mark.parametrize("quarters", range(4))
@@ -708,10 +708,10 @@ def test_what_counts_for_passing_is_the_speed_along_the_obstacle(
             x = Ned(-x.east, x.north, x.down)
         return x
 
-    other = obstacle.other_end_ned_m
+    other = obstacle.last_seen_ned_m
     there = obstacle._replace(
         position_ned_m=turned(obstacle.position_ned_m), velocity_ned_m_s=turned(obstacle.velocity_ned_m_s),
-        other_end_ned_m=None if other is None else turned(other),
+        last_seen_ned_m=None if other is None else turned(other),
     )  # fmt: skip
     f = settled(replace(LIMITS, jerk_max_m_s3=1e9))
     s = applied(f, command(turned(Ned(3.0, 0.0, 0.0))), state(velocity=turned(Ned(1.0, 0.0, 0.0))), [there])
@@ -889,7 +889,7 @@ def test_a_follower_passes_a_lost_vehicle_that_stopped_in_its_column(length: flo
         np.array([0.0, 0.0, -10.0]), np.array([1.0, 0.0, 0.0]), toward(slot_from(0.0)),
         SafetyFilter(replace(LIMITS, barrier=barrier)),
     )  # fmt: skip
-    lost = peer(Ned(3.0 + length, 0.0, -10.0), vehicle_id=5, uncertainty_m=0.6, other_end_ned_m=Ned(3.0, 0.0, -10.0))
+    lost = peer(Ned(3.0 + length, 0.0, -10.0), vehicle_id=5, uncertainty_m=0.6, last_seen_ned_m=Ned(3.0, 0.0, -10.0))
     nearest = fly([follower], 30.0, lambda _: [lost])
     if barrier:
         assert nearest >= 1.24
@@ -907,7 +907,7 @@ def test_a_column_of_followers_passes_it_one_after_the_other(barrier: bool) -> N
         )
         for k in range(3)
     ]  # fmt: skip
-    lost = peer(Ned(6.0, 0.0, -10.0), vehicle_id=9, other_end_ned_m=Ned(3.0, 0.0, -10.0))
+    lost = peer(Ned(6.0, 0.0, -10.0), vehicle_id=9, last_seen_ned_m=Ned(3.0, 0.0, -10.0))
     nearest = fly(flyers, 45.0, lambda _: [lost])
     assert nearest >= 0.97 if barrier else nearest < COLLISION_DISTANCE_M
     if barrier:

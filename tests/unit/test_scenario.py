@@ -6,8 +6,8 @@ import pytest
 
 from companion.config import FleetConfig, load
 from companion.errors import ConfigError
-from sim.faults import load_scenario
-from sim.px4.faults import FaultKind
+from sim.autopilot.faults import FaultKind
+from sim.launch.faults import load_scenario
 
 ROOT = Path(__file__).resolve().parents[2]
 

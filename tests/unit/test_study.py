@@ -23,7 +23,7 @@ from sim.study.faults import _ablated
 from sim.study.run import study
 from sim.study.scale import step_costs
 from sim.study.theory import lyapunov, shortest_interval_s
-from sim.swarm import run
+from sim.swarm.swarm import run
 
 
 def _quiet() -> Console:

@@ -8,11 +8,12 @@ import pytest
 
 pytest.importorskip("numba")
 
-from companion.core import law, safety
-from companion.core.hold import axis, damped
-from companion.core.intent import IntentGains, response
+from companion.core.law import starling as law
+from companion.core.law.intent import IntentGains, response
+from companion.core.prediction import axis, damped
+from companion.core.safety import filter as safety
 from companion.errors import ConfigError
-from sim.swarm import Formation, NeighbourList, Setup, kernels, run, setup_from, starts
+from sim.swarm.swarm import Formation, NeighbourList, Setup, kernels, run, setup_from, starts
 
 SHORT = Setup(duration_s=12.0)
 GUSTY = replace(SHORT, gust_m_s2=0.3, sigma_p_m=0.05, sigma_v_m_s=0.05)

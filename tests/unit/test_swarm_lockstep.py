@@ -11,8 +11,8 @@ pytest.importorskip("numba")
 
 from companion.config import load
 from companion.core.values import Phase
-from sim.lockstep import UTC_AT_START_NS, Lockstep
-from sim.swarm import Formation, Run, Setup, run
+from sim.lockstep.lockstep import UTC_AT_START_NS, Lockstep
+from sim.swarm.swarm import Formation, Run, Setup, run
 
 FLEET = Path(__file__).resolve().parents[2] / "fleet.toml"
 COUNT = 4
@@ -42,13 +42,10 @@ def _lockstep_flight(kind: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.
     start = np.array([[*v.autopilot.truth().position_ned_m, *v.autopilot.truth().velocity_ned_m_s]
                       for v in ls.vehicles.values()])  # fmt: skip
     pushed = ls.vehicles[2]
-    programme = pushed.agent.programme
+    history = pushed.agent.history
     table = np.array(
         [
-            [
-                np.concatenate(programme.reference(i, begin_ns + UTC_AT_START_NS + round(k * 1e7))[:3])
-                for i in ls.vehicles
-            ]
+            [np.concatenate(history.reference(i, begin_ns + UTC_AT_START_NS + round(k * 1e7))[:3]) for i in ls.vehicles]
             for k in range(round(SECONDS / 0.01) + 1)
         ]
     )

@@ -38,7 +38,7 @@ def test_readiness_and_the_end_are_told(manager: tuple[socket.socket, str]) -> N
     s, name = manager
     notifier = Notifier({"NOTIFY_SOCKET": name})
     notifier.ready()
-    notifier.turned(SECOND_NS)
+    notifier.loop_turned(SECOND_NS)
     notifier.stopping()
     notifier.close()
     assert heard(s) == ["READY=1", "STOPPING=1"]
@@ -49,7 +49,7 @@ def test_the_watchdog_is_fed_three_times_within_its_limit_and_only_by_turns(mana
     notifier = Notifier({"NOTIFY_SOCKET": name, "WATCHDOG_USEC": "3000000", "WATCHDOG_PID": str(os.getpid())})
     fed = []
     for k in range(300):
-        notifier.turned(SECOND_NS + k * SECOND_NS // 50)
+        notifier.loop_turned(SECOND_NS + k * SECOND_NS // 50)
         fed += [k / 50] * len(heard(s))
     assert fed == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
     notifier.close()
@@ -58,7 +58,7 @@ def test_the_watchdog_is_fed_three_times_within_its_limit_and_only_by_turns(mana
 def test_a_watchdog_meant_for_another_process_is_not_fed(manager: tuple[socket.socket, str]) -> None:
     s, name = manager
     notifier = Notifier({"NOTIFY_SOCKET": name, "WATCHDOG_USEC": "3000000", "WATCHDOG_PID": "1"})
-    notifier.turned(SECOND_NS)
+    notifier.loop_turned(SECOND_NS)
     notifier.close()
     assert heard(s) == []
 
@@ -69,7 +69,7 @@ def test_a_watchdog_meant_for_another_process_is_not_fed(manager: tuple[socket.s
 def test_without_a_manager_nothing_happens(environment: dict[str, str]) -> None:
     notifier = Notifier({**environment, "WATCHDOG_USEC": "word"})
     notifier.ready()
-    notifier.turned(SECOND_NS)
+    notifier.loop_turned(SECOND_NS)
     notifier.stopping()
     notifier.close()
     notifier.stopping()

@@ -5,8 +5,8 @@ from math import exp, inf, nextafter, sqrt
 
 import pytest
 
-from companion.core.hold import HoldKind, axis, weights
 from companion.core.monitor import PeerMotion, prediction_error_bound_m, unheard_error_m
+from companion.core.prediction import HoldKind, axis, weights
 from companion.core.trigger import (
     RAISED_MAX_M,
     ErrorTrigger,

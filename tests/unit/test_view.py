@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
-from sim.view import show_summary, status_table
+from sim.launch.view import show_summary, status_table
 
 LONG = "its clock is 0.341 s behind that of vehicle 3, " * 12
 REMARKS = st.text(max_size=300) | st.sampled_from([LONG, "[red]bold[/red]", "\x1b[2J\n\n\r\t", "飛行" * 60, ""])

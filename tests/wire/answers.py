@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 from autopilot_flight import mavlink
 
-from sim.px4.modes import Mode
+from sim.autopilot.modes import Mode
 
 ACCEPTED, REJECTED, DENIED, UNSUPPORTED, FAILED = 0, 1, 2, 3, 4
 NOBODY = None

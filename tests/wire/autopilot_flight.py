@@ -9,9 +9,9 @@ os.environ["MAVLINK20"] = "1"
 from pymavlink.dialects.v20 import development as mavlink
 
 from companion.core.frames import Geodetic, Ned
-from sim.autopilot import Autopilot
-from sim.dynamics import DynamicsParameters, GustParameters, NoiseParameters
-from sim.px4.modes import Mode
+from sim.autopilot.autopilot import Autopilot
+from sim.autopilot.dynamics import DynamicsParameters, GustParameters, NoiseParameters
+from sim.autopilot.modes import Mode
 
 ORIGIN = Geodetic(47.3977415, 8.5455929, 489.69)
 """the recorded vehicle's own origin"""

@@ -6,7 +6,7 @@ import pytest
 from autopilot_flight import Flight, mavlink
 
 from companion.core.frames import ned_to_geodetic
-from sim.px4.modes import Mode
+from sim.autopilot.modes import Mode
 
 ACCEPTED, REJECTED, DENIED, UNSUPPORTED, FAILED = 0, 1, 2, 3, 4
 SET_MODE = mavlink.MAV_CMD_DO_SET_MODE

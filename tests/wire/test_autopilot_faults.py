@@ -6,8 +6,8 @@ import pytest
 from autopilot_flight import ORIGIN, Flight, mavlink
 
 from companion.core.frames import Geodetic, Ned, geodetic_to_ned
-from sim.px4.faults import Fault, FaultKind, decode_order, encode_order
-from sim.px4.modes import Mode
+from sim.autopilot.faults import Fault, FaultKind, decode_order, encode_order
+from sim.autopilot.modes import Mode
 
 
 def flying(*streams: str, **parameters: float | int) -> Flight:

@@ -3,8 +3,8 @@
 import pytest
 from autopilot_flight import Flight, mavlink
 
-from sim.dynamics import DynamicsParameters, GustParameters, NoiseParameters
-from sim.px4.modes import LandedState, Mode
+from sim.autopilot.dynamics import DynamicsParameters, GustParameters, NoiseParameters
+from sim.autopilot.modes import LandedState, Mode
 
 
 def landed_states(flight: Flight) -> list[int]:

@@ -17,9 +17,9 @@ from autopilot_flight import (
 )
 
 from companion.core.frames import Ned
-from sim.dynamics import DynamicsParameters
-from sim.px4.modes import Mode, OffboardLossAction
-from sim.px4.offboard import decode_setpoint
+from sim.autopilot.dynamics import DynamicsParameters
+from sim.autopilot.modes import Mode, OffboardLossAction
+from sim.autopilot.offboard import decode_setpoint
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 sys.path.insert(0, str(GOLDEN))

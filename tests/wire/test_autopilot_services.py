@@ -8,9 +8,9 @@ from autopilot_flight import Flight, mavlink
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim.autopilot import STEP_NS
-from sim.px4.modes import Mode
-from sim.px4.parameters import DEFAULTS, ParameterTable
+from sim.autopilot.autopilot import STEP_NS
+from sim.autopilot.modes import Mode
+from sim.autopilot.parameters import DEFAULTS, ParameterTable
 
 INT32, REAL32 = mavlink.MAV_PARAM_TYPE_INT32, mavlink.MAV_PARAM_TYPE_REAL32
 

@@ -16,10 +16,10 @@ import pytest
 from autopilot_flight import UTC_OFFSET_NS, Flight, mavlink
 
 from companion.core.frames import Geodetic, Ned, geodetic_to_ned, ned_to_geodetic
-from sim.dynamics import DynamicsParameters, GustParameters, NoiseParameters
-from sim.px4.modes import Mode
-from sim.px4.streams import STREAMS
-from sim.px4.telemetry import Projection, to_body
+from sim.autopilot.dynamics import DynamicsParameters, GustParameters, NoiseParameters
+from sim.autopilot.modes import Mode
+from sim.autopilot.streams import STREAMS
+from sim.autopilot.telemetry import Projection, to_body
 
 RECORDED = json.loads((Path(__file__).parents[1] / "golden" / "px4_streams.json").read_text())
 RECORDING_BEGINS_S = 13.24

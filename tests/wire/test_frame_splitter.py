@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import development as dialect
 
-from companion.wire.mavlink import FrameSplitter, Heartbeat, LocalPosition, MavlinkLink
+from companion.wire.mavlink import FrameSplitter, Heartbeat, LocalPosition, MavlinkCodec
 
 SYSTEM_ID = 7
 
@@ -53,10 +53,10 @@ def test_a_damaged_byte_costs_few_frames_and_none_is_read_wrongly(at: int, value
     sent = frames(40)
     stream = bytearray(b"".join(sent))
     stream[at] = value
-    splitter, link = FrameSplitter(), MavlinkLink(SYSTEM_ID)
+    splitter, link = FrameSplitter(), MavlinkCodec(SYSTEM_ID)
     got = [f for piece in pieces(bytes(stream), cuts) for f in splitter.split(piece)]
     events = [e for f in got for e in link.decode(f)]
-    genuine = [e for f in sent for e in MavlinkLink(SYSTEM_ID).decode(f)]
+    genuine = [e for f in sent for e in MavlinkCodec(SYSTEM_ID).decode(f)]
     assert all(e in genuine for e in events)
     assert len(events) >= len(genuine) - 9
 
@@ -65,7 +65,7 @@ def test_mavlink_1_is_read_too_as_px4_begins_with_it_on_a_serial_line() -> None:
     sender: Any = dialect.MAVLink(None, srcSystem=SYSTEM_ID, srcComponent=1)
     heartbeat = bytes(dialect.MAVLink_heartbeat_message(2, 12, 81, 65536, 3, 3).pack(sender, force_mavlink1=True))
     assert heartbeat[0] == 0xFE
-    splitter, link = FrameSplitter(), MavlinkLink(SYSTEM_ID)
+    splitter, link = FrameSplitter(), MavlinkCodec(SYSTEM_ID)
     got = splitter.split(heartbeat + frames(1)[0])
     events = [e for f in got for e in link.decode(f)]
     assert [type(e) for e in events] == [Heartbeat, LocalPosition]

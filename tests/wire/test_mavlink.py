@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import development as dialect
 
 from companion.core.frames import Geodetic, Ned
 from companion.wire import mavlink as wire
-from companion.wire.mavlink import MavlinkLink, Px4Mode, mode_name
+from companion.wire.mavlink import MavlinkCodec, Px4Mode, mode_name
 
 SYSTEM_ID = 7
 
@@ -73,7 +73,7 @@ HEARD: list[tuple[Any, wire.Event]] = [
 
 
 def test_a_setpoint_is_altitude_by_position_and_the_level_by_velocity_and_acceleration() -> None:
-    link = MavlinkLink(SYSTEM_ID)
+    link = MavlinkCodec(SYSTEM_ID)
     datagram = link.setpoint(123_456, -10.5, Ned(1.0, -2.0, 0.25), (3.0, -4.0), 0.5)
     message = read(datagram)
     assert message.get_type() == "SET_POSITION_TARGET_LOCAL_NED"
@@ -91,19 +91,19 @@ def test_a_setpoint_is_altitude_by_position_and_the_level_by_velocity_and_accele
 
 
 def test_boot_time_in_a_setpoint_runs_round_the_counter() -> None:
-    link = MavlinkLink(SYSTEM_ID)
+    link = MavlinkCodec(SYSTEM_ID)
     assert read(link.setpoint(-1, 0.0, Ned(0.0, 0.0, 0.0), (0.0, 0.0), 0.0)).time_boot_ms == 2**32 - 1
 
 
 def test_the_heartbeat_is_that_of_an_onboard_controller_of_the_same_system() -> None:
-    message = read(MavlinkLink(SYSTEM_ID).heartbeat())
+    message = read(MavlinkCodec(SYSTEM_ID).heartbeat())
     assert (message.get_srcSystem(), message.get_srcComponent()) == (SYSTEM_ID, 191)
     assert (message.type, message.autopilot) == (18, 8)
     assert (message.base_mode, message.system_status, message.mavlink_version) == (0, 4, 3)
 
 
 def test_sequence_numbers_rise_by_one_with_every_datagram() -> None:
-    link = MavlinkLink(SYSTEM_ID)
+    link = MavlinkCodec(SYSTEM_ID)
     sequence = [
         read(d).get_seq() for _ in range(100) for d in (link.heartbeat(), link.command(400, 1.0), link.heartbeat())
     ]
@@ -128,7 +128,7 @@ def test_a_command_reaches_the_own_autopilot_with_its_parameters(
     parameters: tuple[float, ...], command: int, values: Iterable[float]
 ) -> None:
     number, *rest = parameters
-    message = read(MavlinkLink(SYSTEM_ID).command(int(number), *rest))
+    message = read(MavlinkCodec(SYSTEM_ID).command(int(number), *rest))
     assert message.get_type() == "COMMAND_LONG"
     assert (message.target_system, message.target_component, message.confirmation) == (SYSTEM_ID, 1, 0)
     assert message.command == command
@@ -148,13 +148,13 @@ def test_a_parameter_is_a_float_or_an_integer_bytewise_in_one() -> None:
 
 @pytest.mark.parametrize(("message", "event"), HEARD, ids=[type(e).__name__ for _, e in HEARD])
 def test_what_the_autopilot_says_is_understood(message: Any, event: wire.Event) -> None:
-    link = MavlinkLink(SYSTEM_ID)
+    link = MavlinkCodec(SYSTEM_ID)
     assert link.decode(packed(message)) == [event]
     assert not link.rejected
 
 
 def test_several_messages_of_one_datagram_are_all_read() -> None:
-    link, sender = MavlinkLink(SYSTEM_ID), autopilot()
+    link, sender = MavlinkCodec(SYSTEM_ID), autopilot()
     datagram = b"".join(packed(message, sender) for message, _ in HEARD)
     assert link.decode(datagram) == [event for _, event in HEARD]
     assert not link.rejected
@@ -164,19 +164,19 @@ def test_mavlink_1_is_read_as_well() -> None:
     message = local_position(*POSITION)
     datagram = bytes(message.pack(autopilot(), force_mavlink1=True))
     assert datagram[0] == 0xFE
-    assert MavlinkLink(SYSTEM_ID).decode(datagram) == [HEARD[0][1]]
+    assert MavlinkCodec(SYSTEM_ID).decode(datagram) == [HEARD[0][1]]
 
 
 @pytest.mark.parametrize(("system_id", "component_id"), [(8, 1), (255, 190), (SYSTEM_ID, 191), (SYSTEM_ID, 0)])
 def test_strangers_are_counted_and_not_heeded(system_id: int, component_id: int) -> None:
-    link = MavlinkLink(SYSTEM_ID)
+    link = MavlinkCodec(SYSTEM_ID)
     for message, _ in HEARD:
         assert link.decode(packed(message, autopilot(system_id, component_id))) == []
     assert link.rejected == {"foreign system": len(HEARD)}
 
 
 def test_answers_to_somebody_elses_commands_are_none_of_ours() -> None:
-    link = MavlinkLink(SYSTEM_ID)
+    link = MavlinkCodec(SYSTEM_ID)
     assert link.decode(packed(dialect.MAVLink_command_ack_message(176, 0, 0, 0, 255, 190))) == []
     assert link.decode(packed(dialect.MAVLink_command_ack_message(176, 0))) == [wire.CommandAnswer(176, 0)]
 
@@ -184,7 +184,7 @@ def test_answers_to_somebody_elses_commands_are_none_of_ours() -> None:
 @pytest.mark.parametrize("value", [nan, inf, -inf, 3e38, -1.1e6])
 @pytest.mark.parametrize("at", range(6))
 def test_a_position_that_is_not_finite_or_absurd_is_counted_and_dropped(value: float, at: int) -> None:
-    link = MavlinkLink(SYSTEM_ID)
+    link = MavlinkCodec(SYSTEM_ID)
     numbers = list(POSITION)
     numbers[at] = value
     assert link.decode(packed(local_position(*numbers))) == []
@@ -193,13 +193,13 @@ def test_a_position_that_is_not_finite_or_absurd_is_counted_and_dropped(value: f
 
 @pytest.mark.parametrize(("latitude", "longitude"), [(900_000_001, 0), (-2_147_483_648, 0), (0, 1_800_000_001)])
 def test_an_origin_that_is_nowhere_on_earth_is_counted_and_dropped(latitude: int, longitude: int) -> None:
-    link = MavlinkLink(SYSTEM_ID)
+    link = MavlinkCodec(SYSTEM_ID)
     assert link.decode(packed(dialect.MAVLink_gps_global_origin_message(latitude, longitude, 0, 0))) == []
     assert link.rejected == {"out of range": 1}
 
 
 def test_messages_that_nobody_reads_are_left_undecoded() -> None:
-    link, sender = MavlinkLink(SYSTEM_ID), autopilot()
+    link, sender = MavlinkCodec(SYSTEM_ID), autopilot()
     attitude = dialect.MAVLink_attitude_message(0, 0.1, 0.2, 0.3, 0.0, 0.0, 0.0)
     datagram = bytearray(packed(attitude, sender))
     assert link.decode(bytes(datagram)) == []
@@ -213,7 +213,7 @@ def test_messages_that_nobody_reads_are_left_undecoded() -> None:
 def test_any_single_bit_may_flip_and_the_next_datagram_is_read() -> None:
     whole = packed(local_position(*POSITION))
     for bit in range(8 * len(whole)):
-        link = MavlinkLink(SYSTEM_ID)
+        link = MavlinkCodec(SYSTEM_ID)
         flipped = bytearray(whole)
         flipped[bit // 8] ^= 1 << bit % 8
         assert link.decode(bytes(flipped)) == [], bit
@@ -224,7 +224,7 @@ def test_any_single_bit_may_flip_and_the_next_datagram_is_read() -> None:
 def test_a_truncated_datagram_is_counted_and_takes_nothing_of_the_next() -> None:
     whole = packed(local_position(*POSITION))
     for cut in range(len(whole)):
-        link = MavlinkLink(SYSTEM_ID)
+        link = MavlinkCodec(SYSTEM_ID)
         assert link.decode(whole[:cut]) == []
         assert link.rejected == {"malformed": 1}
         assert link.decode(whole) == [HEARD[0][1]]
@@ -233,7 +233,7 @@ def test_a_truncated_datagram_is_counted_and_takes_nothing_of_the_next() -> None
 def test_a_message_that_is_cut_off_behind_a_whole_one_takes_nothing_of_the_next_datagram() -> None:
     whole = packed(local_position(*POSITION))
     for cut in range(1, len(whole)):
-        link = MavlinkLink(SYSTEM_ID)
+        link = MavlinkCodec(SYSTEM_ID)
         assert link.decode(whole + whole[:cut]) == [HEARD[0][1]]
         assert link.rejected == {"malformed": 1}
         assert link.decode(whole) == [HEARD[0][1]]
@@ -247,7 +247,7 @@ def test_a_message_with_flags_that_nobody_knows_is_dropped_as_the_protocol_deman
     checksum = dialect.x25crc(datagram[1:-2])
     checksum.accumulate(struct.pack("B", message.crc_extra))
     struct.pack_into("<H", datagram, len(datagram) - 2, checksum.crc)
-    link = MavlinkLink(SYSTEM_ID)
+    link = MavlinkCodec(SYSTEM_ID)
     assert link.decode(bytes(datagram)) == []
     assert link.rejected == {"malformed": 1}
 
@@ -268,7 +268,7 @@ READ_IDS = sorted({0, 1, 22, 32, 49, 77, 230, 245, 436})
 def test_any_payload_under_a_right_checksum_is_read_or_counted(
     message_id: int, payload: bytes, sender: tuple[int, int]
 ) -> None:
-    link = MavlinkLink(SYSTEM_ID)
+    link = MavlinkCodec(SYSTEM_ID)
     crc_extra = dialect.mavlink_map[message_id].crc_extra
     events = link.decode(resigned(message_id, crc_extra, payload, sender))
     for event in events:
@@ -281,7 +281,7 @@ def test_any_payload_under_a_right_checksum_is_read_or_counted(
 @settings(max_examples=300, deadline=None)
 @given(st.lists(st.binary(max_size=300) | st.sampled_from([packed(m) for m, _ in HEARD]), max_size=5))
 def test_any_bytes_are_counted_or_read_and_never_raise(datagrams: list[bytes]) -> None:
-    link = MavlinkLink(SYSTEM_ID)
+    link = MavlinkCodec(SYSTEM_ID)
     for datagram in datagrams:
         link.decode(datagram)
         link.decode(b"\xfd" + datagram)
@@ -291,7 +291,7 @@ def test_any_bytes_are_counted_or_read_and_never_raise(datagrams: list[bytes]) -
 def test_thousands_of_mutated_datagrams_are_counted_or_read_and_never_raise() -> None:
     noise = random.Random(5)
     whole = [packed(m) for m, _ in HEARD]
-    link = MavlinkLink(SYSTEM_ID)
+    link = MavlinkCodec(SYSTEM_ID)
     for _ in range(3000):
         datagram = bytearray(noise.choice(whole) + noise.choice(whole))
         for _ in range(noise.randrange(1, 6)):
@@ -336,14 +336,14 @@ def test_a_frames_fields_are_unpacked_as_pymavlink_unpacks_them(payload: bytes, 
 
 @pytest.mark.parametrize(("told", "means"), [(0, 0), (55, 55), (100, 100), (-1, -1), (-5, -1), (101, -1), (127, -1)])
 def test_a_charge_that_is_none_is_unknown(told: int, means: int) -> None:
-    link = MavlinkLink(SYSTEM_ID)
+    link = MavlinkCodec(SYSTEM_ID)
     message = dialect.MAVLink_sys_status_message(0, 0, 0, 0, 0, 0, told, 0, 0, 0, 0, 0, 0)
     (event,) = link.decode(bytes(message.pack(autopilot())))
     assert event == wire.SystemHealth(0, means)
 
 
 def test_an_origin_at_zero_zero_is_none() -> None:
-    link = MavlinkLink(SYSTEM_ID)
+    link = MavlinkCodec(SYSTEM_ID)
     assert link.decode(bytes(dialect.MAVLink_gps_global_origin_message(0, 0, 488_000, 0).pack(autopilot()))) == []
     assert link.rejected["out of range"] == 1
     (event,) = link.decode(bytes(dialect.MAVLink_gps_global_origin_message(1, 0, 0, 0).pack(autopilot())))
@@ -351,7 +351,7 @@ def test_an_origin_at_zero_zero_is_none() -> None:
 
 
 def test_a_heartbeat_of_what_is_no_autopilot_says_nothing_of_arming_or_mode() -> None:
-    link = MavlinkLink(SYSTEM_ID)
+    link = MavlinkCodec(SYSTEM_ID)
     invalid = dialect.MAVLink_heartbeat_message(6, dialect.MAV_AUTOPILOT_INVALID, 0, 0, 4, 3)
     assert link.decode(bytes(invalid.pack(autopilot()))) == []
     assert link.rejected["heartbeat of no autopilot"] == 1

@@ -12,7 +12,17 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from companion.core.frames import Ned
-from companion.core.motion_check import (
+from companion.core.trajectory import (
+    BLEND_MIN_S,
+    GOTO_MIN_S,
+    FleetTrajectory,
+    GotoLeg,
+    Leg,
+    SlotChange,
+    TurnLeg,
+    VelocityLeg,
+)
+from companion.core.trajectory_check import (
     DURATION_MAX_S,
     MOTION_BYTES_MAX,
     PLACE_MAX_M,
@@ -22,7 +32,6 @@ from companion.core.motion_check import (
     TURN_RATE_MIN_RAD_S,
     VELOCITY_MAX_M_S,
 )
-from companion.core.plan import BLEND_MIN_S, GOTO_MIN_S, GotoLeg, Leg, Motion, SlotChange, TurnLeg, VelocityLeg
 from companion.core.values import PeerMessage, PeerSample, Phase
 from companion.errors import WireError
 from companion.wire.peer import (
@@ -60,7 +69,7 @@ legs: st.SearchStrategy[Leg] = st.one_of(
 )
 nanoseconds = st.integers(0, 2**63 - 1)
 motions = st.builds(
-    Motion,
+    FleetTrajectory,
     revision=words, start_ns=nanoseconds, issuer=bytes_8, shape=st.text(max_size=32),
     slots=st.dictionaries(st.integers(1, 250), st.builds(SlotChange, places, places), min_size=1, max_size=5),
     blend_start_ns=nanoseconds, blend_s=st.just(0.0) | st.floats(BLEND_MIN_S, DURATION_MAX_S),
@@ -73,7 +82,7 @@ motions = st.builds(
 SAMPLE = PeerSample(3, 1_700_000_000_000_000_000, Ned(1.0, 2.0, -10.0), Ned(0.5, 0.25, 0.0), 2, Phase.FORMED)
 MESSAGE = PeerMessage(7, 9, 1_700_000_000_000_000_000, 4, SAMPLE, (SAMPLE, SAMPLE), (2, 4), True)
 FLAGS_AT = 25
-MOTION = Motion(
+MOTION = FleetTrajectory(
     revision=2, start_ns=5, issuer=3, shape="v", slots={1: SlotChange(Ned(0, 4, 0), Ned(0, 4, 0))}, blend_start_ns=1,
     blend_s=8.0, legs_start_ns=5, centre_ned_m=Ned(0.0, 0.0, -10.0), velocity_ned_m_s=Ned(0.0, 0.0, 0.0),
     heading_rad=0.1, heading_rate_rad_s=0.0, heading_follows_turns=False,
@@ -194,7 +203,7 @@ def test_a_number_that_is_not_finite_or_absurd_is_refused_wherever_it_stands(
 
 
 @given(motions)
-def test_a_motion_survives_the_wire_to_the_bit(motion: Motion) -> None:
+def test_a_motion_survives_the_wire_to_the_bit(motion: FleetTrajectory) -> None:
     assert decode_motion(encode_motion(motion)) == motion
 
 
@@ -213,7 +222,7 @@ def check_motion(payload: bytes) -> None:
         return
     decode_motion(encode_motion(motion))
     for time_ns in (0, motion.start_ns, motion.legs_start_ns, motion.end_ns or 0, 2**63):
-        moment = motion.moment(time_ns)
+        moment = motion.state_at(time_ns)
         for slots in motion.slots.values():
             for vector in moment.slot(slots)[:3]:
                 assert all(abs(x) < 1e20 for x in vector), (time_ns, vector)
@@ -221,7 +230,7 @@ def check_motion(payload: bytes) -> None:
 
 @settings(deadline=None)
 @given(motions)
-def test_a_motion_that_is_taken_has_a_finite_reference_at_every_time(motion: Motion) -> None:
+def test_a_motion_that_is_taken_has_a_finite_reference_at_every_time(motion: FleetTrajectory) -> None:
     check_motion(encode_motion(motion))
 
 

@@ -1,0 +1,97 @@
+"""The stub autopilots that a fleet.toml asks for."""
+
+from math import cos, pi, radians, sin
+from pathlib import Path
+from random import Random
+
+from companion.config import FleetConfig, Vehicle, autopilot_port, companion_port, udp_endpoint
+from companion.core.frames import Ned
+from companion.errors import ConfigError
+from sim.autopilot.dynamics import DynamicsParameters, GustParameters, NoiseParameters
+from sim.autopilot.parameters import defaults
+from sim.autopilot.stubs import StubFleetSettings, StubVehicleSettings
+
+LAND_ON_LOSS = 4
+FLEET_PARAMETERS: tuple[tuple[str, float | int], ...] = (
+    ("COM_OBL_RC_ACT", LAND_ON_LOSS),
+    ("COM_RC_OVERRIDE", 3),
+    ("MAN_OVERRIDE_SPD", 1.0),
+    ("NAV_RCL_ACT", 0),
+    ("COM_RCL_EXCEPT", 4),
+)
+"""PX4 parameters of a fleet without RC, where a version has them: land when the setpoints end; OFFBOARD needs no RC"""
+
+
+def _ports(vehicle: Vehicle) -> tuple[int, int]:
+    """The stub's UDP port and its companion's: the one in the vehicle's URL, and PX4's distance from it."""
+    endpoint = udp_endpoint(vehicle.mavlink)
+    companion = companion_port(vehicle.instance) if endpoint is None else endpoint[1]
+    return autopilot_port(vehicle.instance, companion), companion
+
+
+def stub_port(vehicle: Vehicle) -> int:
+    """The UDP port that the vehicle's stub binds."""
+    return _ports(vehicle)[0]
+
+
+def check_stub_links(config: FleetConfig) -> None:
+    """Raise ConfigError if a vehicle's link cannot be a stub's; lockstep, which has no sockets, does not mind."""
+    for v in config.vehicles:
+        where = f"vehicle {v.id}: mavlink = {v.mavlink!r}"
+        endpoint = udp_endpoint(v.mavlink)
+        if endpoint is None or endpoint[0] not in ("0.0.0.0", "127.0.0.1", "localhost"):
+            raise ConfigError(f"{where}: a stub speaks to udp://127.0.0.1:PORT only")
+        own, _ = _ports(v)
+        if own > 65535:
+            raise ConfigError(f"{where}: the stub's own port would be {own}; the companion's must be lower")
+
+
+def stub_settings(
+    config: FleetConfig,
+    *,
+    seed: int,
+    truth_path: Path | None = None,
+    stop_fd: int | None = None,
+    grace_s: float = 0.0,
+    ground: bool = False,
+) -> StubFleetSettings:
+    """Settings of the stubs; each estimator's origin lies elsewhere, by up to `stub.origin_scatter_m`, after `seed`."""
+    stub = config.stub
+    random = Random(f"origins/{seed}")
+    known = defaults(stub.px4_version)
+    vehicles = []
+    for k, v in enumerate(config.vehicles):
+        way, angle = stub.origin_scatter_m * random.random(), 2.0 * pi * random.random()
+        offset = Ned(way * cos(angle), way * sin(angle), 0.2 * stub.origin_scatter_m * (random.random() - 0.5))
+        own, companion = _ports(v)
+        vehicles.append(
+            StubVehicleSettings(
+                vehicle_id=v.id,
+                instance=v.instance,
+                system_id=v.system_id,
+                autopilot_port=own,
+                companion_port=companion,
+                home_ned_m=Ned(v.pad_north_m, v.pad_east_m, 0.0),
+                ekf_origin_offset_m=offset if config.fleet.frame == "global" else Ned(
+                    -v.pad_north_m, -v.pad_east_m, 0.0
+                ),
+                yaw_rad=radians(config.formation.heading_deg),
+                booted_before_ns=round(k / len(config.vehicles) * 1e9 / config.limits.control_rate_hz),
+                parameters=tuple((name, value) for name, value in FLEET_PARAMETERS if name in known),
+                px4_version=stub.px4_version,
+            )
+        )  # fmt: skip
+    return StubFleetSettings(
+        vehicles=tuple(vehicles),
+        fleet_origin=config.origin,
+        dynamics=DynamicsParameters(
+            model=stub.dynamics, attitude_lag_s=stub.lag_s, drag_per_s=stub.drag_per_s
+        ),
+        gust=GustParameters(sigma_m_s2=stub.gust_m_s2),
+        noise=NoiseParameters(position_sigma_m=stub.position_noise_m, velocity_sigma_m_s=stub.velocity_noise_m_s),
+        seed=seed,
+        truth_path=truth_path,
+        stop_fd=stop_fd,
+        grace_s=grace_s,
+        ground=ground,
+    )  # fmt: skip

@@ -1,0 +1,432 @@
+"""Real PX4 SITL instances (SIH quadrotor, headless) in the place of stubs: started, parametrised, watched, ended.
+
+PX4 takes instance numbers: instance i has system id i + 1 and speaks to UDP 14540 + i; past ten it would send all to
+14549, so those get one more MAVLink link by the port rule of `companion.config`. The simulator's truth comes as
+HIL_STATE_QUATERNION on 19410 + i, the state of arming and mode from the ground station's link on 14550.
+"""
+
+import json
+import os
+import re
+import select
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from math import hypot, isfinite
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from companion.config import FleetConfig, Vehicle, autopilot_port, companion_port
+from companion.core.frames import Geodetic, Ned, geodetic_to_ned, ned_to_geodetic
+from companion.errors import CompanionError, ConfigError
+from companion.io.link import SO_TIMESTAMPNS, received_unix_ns
+from companion.vehicle.preflight import same_setting
+from companion.wire.mavlink import dialect as mavlink
+from companion.wire.mavlink import interval_parameters, parameter_value
+from sim.autopilot.stubs import TRUTH_DTYPE
+
+GCS_PORT = 14550
+GCS_PORT_OF_INSTANCE = 18570
+TRUTH_PORT = 19410
+PX4_PORTS = 10
+"""instances for which PX4's own scripts open an offboard link of their own"""
+STARTUP_TIMEOUT_S = 30.0
+END_TIMEOUT_S = 6.0
+FLUSH_INTERVAL_NS = 500_000_000
+RECEIVE_BUFFER_BYTES = 1 << 20
+CURRENT_MODE = 436
+STATE_MESSAGES = frozenset({0, 22, 30, 77, 245, CURRENT_MODE})
+"""HEARTBEAT, PARAM_VALUE, ATTITUDE, COMMAND_ACK, EXTENDED_SYS_STATE and CURRENT_MODE"""
+TRUTH_MESSAGES = frozenset({115})
+"""HIL_STATE_QUATERNION"""
+ENDED_FILE = "autopilots-ended.jsonl"
+"""in the flight's folder: a line [vehicle id, how] for each autopilot that has ended in flight"""
+MODE_RATE_HZ = 20.0
+SIH_QUADROTOR = 10040
+FLEET_PARAMETERS: Mapping[str, float | int] = {
+    "COM_OBL_RC_ACT": 4,
+    "COM_RC_OVERRIDE": 3,
+    "MAN_OVERRIDE_SPD": 1.0,
+    "COM_RC_IN_MODE": 4,
+    "NAV_RCL_ACT": 0,
+    "NAV_DLL_ACT": 0,
+    "COM_RCL_EXCEPT": 4,
+    "SDLOG_MODE": -1,
+}
+"""a fleet without RC: land when the setpoints end; no stick input; no log on disk. Of `preflight.ALTERNATIVES` a
+version has one"""
+SIMULATOR_PARAMETERS: Mapping[str, float | int] = {"EKF2_ACC_NOISE": 0.6, "EKF2_GYR_NOISE": 0.1}
+"""what SIH's sensors are like: in flight their white noise is 0.5, 1.7 and 1.4 m/s^2 and 0.14, 0.07 and 0.03 rad/s a
+sample, of which the estimator's defaults (0.35 and 0.015) know nothing, so that it wanders by half a metre (see
+docs/px4.md)"""
+
+
+@dataclass(frozen=True, slots=True)
+class SitlSettings:
+    """How to run the instances."""
+
+    build: Path
+    """PX4's build folder: holds bin/px4 and etc/"""
+    folder: Path
+    """where each instance gets its own working folder"""
+    truth_path: Path
+    stop_fd: int
+    parameters: Mapping[str, float | int]
+    """beyond FLEET_PARAMETERS and SIMULATOR_PARAMETERS, or instead of one of them"""
+    ready_path: Path | None = None
+    """a file that is made once every parameter was read back as set"""
+    log: Callable[[str], None] = print
+
+
+def parse_parameters(texts: Sequence[str]) -> dict[str, float | int]:
+    """PX4 parameters from the command line, NAME=VALUE each."""
+    parameters: dict[str, float | int] = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        try:
+            if not re.fullmatch("[A-Z][A-Z0-9_]{0,15}", name):
+                raise ValueError(name)
+            number = float(value)
+            if not isfinite(number):
+                raise ValueError(value)
+        except ValueError:
+            raise ConfigError(f"--parameter must be NAME=VALUE, a PX4 parameter and a number, got {text!r}") from None
+        parameters[name] = int(number) if number.is_integer() else number
+    return parameters
+
+
+def check_build(build: Path) -> Path:
+    """The build folder, or CompanionError that says what it needs to hold."""
+    if not (build / "bin" / "px4").is_file() or not (build / "etc").is_dir():
+        raise CompanionError(
+            f"--px4 {build}: is no PX4 build folder (needs bin/px4 and etc/). Get PX4-Autopilot v1.16 from its "
+            "project, run `make px4_sitl_default` there and pass build/px4_sitl_default"
+        )
+    return build.resolve()
+
+
+class Px4Instance:
+    """One running PX4 process. Instance i has system id i + 1 and links as PX4's scripts open them.
+
+    It gets SIGTERM when whoever started it dies, however that may be.
+    """
+
+    def __init__(self, index: int, home: Geodetic, build: Path, folder: Path, parameters: Mapping[str, float | int]):
+        folder = folder.resolve()  # PX4 changes its folder before it reads this
+        folder.mkdir(parents=True)
+        environment = {
+            **{k: v for k, v in os.environ.items() if not k.startswith("PX4_")},
+            "PX4_SIM_MODEL": "sihsim_quadx",
+            "PX4_SYS_AUTOSTART": str(SIH_QUADROTOR),
+            "PX4_HOME_LAT": f"{home.latitude_deg:.9f}",
+            "PX4_HOME_LON": f"{home.longitude_deg:.9f}",
+            "PX4_HOME_ALT": f"{home.altitude_amsl_m:.3f}",
+            **{f"PX4_PARAM_{name}": str(value) for name, value in parameters.items()},
+        }
+        self.index = index
+        self.system_id = index + 1
+        self.parameters = parameters
+        self.build = build
+        with (folder / "px4.log").open("wb") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, "-I", "-S", "-c", _END_WITH_PARENT, str(build / "bin" / "px4"), "-i", str(index),
+                 "-d", str(build / "etc"), "-w", str(folder)],
+                cwd=folder, env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )  # fmt: skip
+
+    def open_offboard_link(self) -> None:
+        """Past ten instances: a link of its own, since PX4's scripts would send all to one port."""
+        command = (
+            "start", "-x", "-u", str(autopilot_port(self.index)), "-r", "4000000", "-f", "-m", "onboard",
+            "-o", str(companion_port(self.index)),
+        )  # fmt: skip
+        done = subprocess.run(
+            [str(self.build / "bin" / "px4-mavlink"), "--instance", str(self.index), *command],
+            check=False, capture_output=True, text=True, timeout=10,
+        )  # fmt: skip
+        if done.returncode != 0:
+            said = f"{done.stdout}{done.stderr}".strip()
+            raise CompanionError(f"PX4 instance {self.index} opens no link on {autopilot_port(self.index)}: {said}")
+
+    def ask_to_end(self) -> None:
+        """SIGTERM, from which PX4 ends in about two seconds."""
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGTERM)
+
+    def end(self) -> None:
+        """End it, with SIGKILL if need be, and wait until it is gone."""
+        self.ask_to_end()
+        try:
+            self.process.wait(END_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+        Path(f"/tmp/px4-sock-{self.index}").unlink(missing_ok=True)
+
+
+_END_WITH_PARENT = f"""
+import ctypes, os, sys
+ctypes.CDLL(None).prctl(1, {int(signal.SIGTERM)})
+os.execv(sys.argv[1], sys.argv[1:])
+"""
+"""PR_SET_PDEATHSIG lasts through exec; set in an interpreter of its own, since forking a process with threads to run
+Python in it may hang"""
+
+
+def tell_ended(folder: Path, vehicle_id: int, how: str) -> None:
+    """Leave word for the launcher that a vehicle's autopilot has ended."""
+    with suppress(OSError), (folder / ENDED_FILE).open("a", encoding="utf-8") as file:
+        file.write(json.dumps([vehicle_id, how]) + "\n")
+
+
+def read_ended(folder: Path) -> dict[int, str]:
+    """Vehicle -> how its autopilot has ended, as told so far."""
+    try:
+        lines = (folder / ENDED_FILE).read_text(encoding="utf-8").splitlines(keepends=True)
+    except OSError:
+        return {}
+    return dict(json.loads(line) for line in lines if line.endswith("\n"))
+
+
+class _Instance:
+    """One vehicle's PX4 with its truth socket, and what it has said."""
+
+    def __init__(self, config: FleetConfig, vehicle: Vehicle, settings: SitlSettings) -> None:
+        self.vehicle = vehicle
+        self.index = vehicle.instance
+        if vehicle.system_id != self.index + 1:
+            raise CompanionError(
+                f"vehicle {vehicle.id}: PX4 instance {self.index} has system id {self.index + 1}, "
+                f"fleet.toml says {vehicle.system_id}"
+            )
+        self.truth_socket = _bind(TRUTH_PORT + self.index, f"vehicle {vehicle.id}'s truth")
+        home = ned_to_geodetic(Ned(vehicle.pad_north_m, vehicle.pad_east_m, 0.0), config.origin)
+        self.parameters = {**FLEET_PARAMETERS, **SIMULATOR_PARAMETERS, **settings.parameters}
+        try:
+            self.px4 = Px4Instance(
+                self.index, home, settings.build, settings.folder / f"px4-{vehicle.id}", self.parameters
+            )
+        except BaseException:
+            self.truth_socket.close()
+            raise
+        self.armed = False
+        self.custom_mode = 0
+        self.landed_state = 1
+        self.checked: dict[str, float | int] = {}
+        self.demanded = frozenset(settings.parameters)
+        """what the user has set: to be read back under that very name"""
+        self.clock: list[tuple[float, float]] = []
+        """(UTC s, the simulation's s), first and latest"""
+        self.mode_streamed = False
+        self.missed = False
+        """whether its early end has been told"""
+
+    def ran_at(self) -> float | None:
+        """Simulated per real time so far."""
+        if len(self.clock) < 2:
+            return None
+        (real0, sim0), (real1, sim1) = self.clock
+        return (sim1 - sim0) / max(real1 - real0, 1e-9)
+
+
+def _bind(port: int, whose: str) -> socket.socket:
+    s = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    s.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+    s.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
+    try:
+        s.bind(("127.0.0.1", port))
+    except OSError as error:
+        s.close()
+        raise CompanionError(f"cannot listen on UDP 127.0.0.1:{port} for {whose}: {error.strerror}") from error
+    s.setblocking(False)
+    return s
+
+
+class SitlHost:
+    """Runs the instances until its standard input ends, recording the simulators' truth."""
+
+    def __init__(self, config: FleetConfig, settings: SitlSettings) -> None:
+        self.config = config
+        self.settings = settings
+        self._stack = ExitStack()
+        self._mav: Any = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
+        self._mav.robust_parsing = True
+        self._flushed_ns = 0
+        try:
+            self._gcs = _bind(GCS_PORT, "the instances' state (is a ground station running?)")
+            self._stack.callback(self._gcs.close)
+            self._file = self._stack.enter_context(settings.truth_path.open("ab"))
+            self.instances: list[_Instance] = []
+            for vehicle in config.vehicles:
+                instance = _Instance(config, vehicle, settings)
+                self._stack.callback(instance.truth_socket.close)
+                self._stack.callback(instance.px4.end)
+                self.instances.append(instance)
+        except BaseException:
+            self._stack.close()
+            raise
+        self._by_system = {i.vehicle.system_id: i for i in self.instances}
+
+    def run(self, grace_s: float) -> None:
+        """Serve until the launcher is gone or says so; then leave the vehicles `grace_s` for their landing commands."""
+        ended: list[bool] = []
+        for s in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(s, lambda *_: ended.append(True))
+        with self._stack:
+            if not self._read_back_parameters(ended):
+                return
+            if self.settings.ready_path is not None:
+                self.settings.ready_path.touch()
+            for instance in self.instances:
+                if instance.index >= PX4_PORTS:
+                    instance.px4.open_offboard_link()
+            until: float | None = None
+            stop_fds = [self.settings.stop_fd]
+            while until is None or time.monotonic() < until:
+                if self._serve(0.1, stop_fds) or ended:
+                    ended.clear()
+                    stop_fds = []
+                    until = time.monotonic() + (grace_s if until is None else 0.0)
+                self._tell_missing()
+            for instance in self.instances:
+                instance.px4.ask_to_end()
+                factor = instance.ran_at()
+                if factor is not None:
+                    self.settings.log(f"vehicle {instance.vehicle.id}: simulated at {factor:.3f} of real time")
+
+    def _tell_missing(self) -> None:
+        """An instance that has ended in flight is told once; the others fly on."""
+        for instance in self.instances:
+            if not instance.missed and (status := instance.px4.process.poll()) is not None:
+                instance.missed = True
+                self.settings.log(f"vehicle {instance.vehicle.id}: PX4 ended with status {status}; see its px4.log")
+                tell_ended(self.settings.folder, instance.vehicle.id, f"PX4 ended with status {status}")
+
+    def _serve(self, timeout_s: float, stop_fds: Sequence[int]) -> bool:
+        sockets: list[Any] = [self._gcs, *(i.truth_socket for i in self.instances)]
+        ready, _, _ = select.select([*sockets, *stop_fds], [], [], timeout_s)
+        if self._gcs in ready:
+            self._read_states()
+        for instance in self.instances:
+            if instance.truth_socket in ready:
+                self._read_truth(instance)
+        return any(fd in ready and not os.read(fd, 4096) for fd in stop_fds)
+
+    def _messages(self, s: socket.socket, wanted: frozenset[int]) -> Iterator[tuple[int, Any]]:
+        """What waits of those kinds, with the time at which the kernel got it (UTC, ns): this process may be late.
+
+        The others, most of the traffic, are told by their heads at a hundredth of a decoding's cost.
+        """
+        while True:
+            try:
+                data, ancillary, _, _ = s.recvmsg(2048, 64)
+            except BlockingIOError:
+                return
+            except ConnectionError:
+                continue
+            if len(data) > 9 and data[7] | data[8] << 8 | data[9] << 16 in wanted:
+                for message in self._mav.parse_buffer(data) or []:
+                    yield received_unix_ns(ancillary), message
+
+    def _read_states(self) -> None:
+        for time_unix_ns, message in self._messages(self._gcs, STATE_MESSAGES):
+            instance = self._by_system.get(message.get_srcSystem())
+            if instance is None or message.get_srcComponent() != 1:
+                continue
+            match message:
+                case mavlink.MAVLink_heartbeat_message():
+                    instance.armed = bool(message.base_mode & 128)
+                    if not instance.mode_streamed:
+                        instance.custom_mode = message.custom_mode
+                case mavlink.MAVLink_current_mode_message():
+                    instance.custom_mode = message.custom_mode
+                case mavlink.MAVLink_command_ack_message():
+                    instance.mode_streamed |= message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
+                case mavlink.MAVLink_attitude_message():
+                    instance.clock[1:] = [(time_unix_ns * 1e-9, message.time_boot_ms * 1e-3)]
+                case mavlink.MAVLink_extended_sys_state_message():
+                    instance.landed_state = message.landed_state
+                case mavlink.MAVLink_param_value_message():
+                    instance.checked[message.param_id.rstrip("\x00")] = parameter_value(message)
+
+    def _read_truth(self, instance: _Instance) -> None:
+        rows = []
+        for time_unix_ns, message in self._messages(instance.truth_socket, TRUTH_MESSAGES):
+            if isinstance(message, mavlink.MAVLink_hil_state_quaternion_message):
+                point = Geodetic(message.lat * 1e-7, message.lon * 1e-7, message.alt * 1e-3)
+                row = np.zeros((), TRUTH_DTYPE)
+                row["time_unix_ns"] = time_unix_ns
+                row["vehicle_id"] = instance.vehicle.id
+                row["armed"], row["landed_state"] = instance.armed, instance.landed_state
+                row["custom_mode"] = instance.custom_mode
+                row["position_ned_m"] = geodetic_to_ned(point, self.config.origin)
+                row["velocity_ned_m_s"] = (message.vx * 1e-2, message.vy * 1e-2, message.vz * 1e-2)
+                row["setpoint_gap_max_s"] = np.nan
+                row["attitude_rate_rad_s"] = hypot(message.rollspeed, message.pitchspeed)
+                rows.append(row.tobytes())
+        self._file.write(b"".join(rows))
+        now_ns = time.monotonic_ns()
+        if now_ns - self._flushed_ns > FLUSH_INTERVAL_NS:
+            self._flushed_ns = now_ns
+            self._file.flush()
+
+    def _read_back_parameters(self, ended: Sequence[bool]) -> bool:
+        """Wait until every parameter set at the start has arrived, and for CURRENT_MODE at a rate worth recording.
+
+        False when ended meanwhile; CompanionError names vehicle and parameter that did not arrive.
+        """
+        deadline = time.monotonic() + STARTUP_TIMEOUT_S
+        command, *interval = interval_parameters(CURRENT_MODE, MODE_RATE_HZ)
+        while time.monotonic() < deadline:
+            waiting = [i for i in self.instances if _missing(i) or not i.mode_streamed]
+            if not waiting:
+                return True
+            for instance in waiting:
+                if instance.px4.process.poll() is not None:
+                    raise CompanionError(f"vehicle {instance.vehicle.id}: PX4 ended at its start; see its px4.log")
+                system_id = instance.vehicle.system_id
+                if not instance.mode_streamed:
+                    self._ask(instance, mavlink.MAVLink_command_long_message(
+                        system_id, 1, command, 0, *interval, 0.0, 0.0, 0.0, 0.0, 0.0
+                    ))  # fmt: skip
+                for name in _missing(instance):
+                    self._ask(instance, mavlink.MAVLink_param_request_read_message(system_id, 1, name.encode(), -1))
+            until = time.monotonic() + 0.5
+            while time.monotonic() < until:
+                if self._serve(0.1, [self.settings.stop_fd]) or ended:
+                    return False
+        missing = {i.vehicle.id: _missing(i) for i in self.instances if _missing(i)}
+        raise CompanionError(f"PX4 parameters not as set after {STARTUP_TIMEOUT_S:.0f} s: {missing or 'silent'}")
+
+    def _ask(self, instance: _Instance, message: Any) -> None:
+        self._gcs.sendto(message.pack(self._mav), ("127.0.0.1", GCS_PORT_OF_INSTANCE + instance.index))
+
+
+def _missing(instance: _Instance) -> dict[str, float | int | None]:
+    """Parameters that were not read back as set, with what was read."""
+    return {
+        name: instance.checked.get(name)
+        for name, value in instance.parameters.items()
+        if not _as_set(instance, name, value) and (name in instance.demanded or not _other_name_set(instance, name))
+    }
+
+
+def _as_set(instance: _Instance, name: str, value: float | int) -> bool:
+    return name in instance.checked and abs(instance.checked[name] - value) <= 1e-6
+
+
+def _other_name_set(instance: _Instance, name: str) -> bool:
+    """Whether another version's name of the same setting was read back as set."""
+    others = (n for n in same_setting(name) if n != name and n in instance.parameters)
+    return name not in instance.checked and any(_as_set(instance, n, instance.parameters[n]) for n in others)
+
+
+__all__ = ["FLEET_PARAMETERS", "Px4Instance", "SitlHost", "SitlSettings", "check_build"]

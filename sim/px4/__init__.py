@@ -1,1 +1,0 @@
-"""The parts of the stand-in PX4; `sim.autopilot.Autopilot` puts them together."""

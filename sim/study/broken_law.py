@@ -1,0 +1,34 @@
+"""A law that is broken: it flies at some velocity, whatever plan and peers say. Only the safety filter is left."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import hypot
+
+from companion.core.frames import Ned
+from companion.core.law.starling import Law
+from companion.core.trajectory import Reference
+from companion.core.values import Command, Neighbour, VehicleState
+
+GAIN_PER_S = 3.0
+PUSH_MAX_M_S2 = 5.0
+
+
+@dataclass(slots=True)
+class BrokenLaw:
+    """A sound law that breaks; give it to an agent as its `law`."""
+
+    sound: Law
+    velocity_ned_m_s: Ned | None = None
+    """what the broken law flies at; None: the law is sound"""
+
+    def command(
+        self, ego: VehicleState, reference: Reference, neighbours: Sequence[Neighbour], *, alone: bool
+    ) -> tuple[Command, Ned]:
+        """The sound law's command and residual, or the broken command in its place."""
+        command, residual = self.sound.command(ego, reference, neighbours, alone=alone)
+        wanted, v = self.velocity_ned_m_s, ego.velocity_ned_m_s
+        if wanted is None:
+            return command, residual
+        north, east = GAIN_PER_S * (wanted.north - v.north), GAIN_PER_S * (wanted.east - v.east)
+        over = max(hypot(north, east) / PUSH_MAX_M_S2, 1.0)
+        return command._replace(acceleration_ned_m_s2=Ned(north / over, east / over, 0.0)), residual
