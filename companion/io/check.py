@@ -83,11 +83,8 @@ def listen(link: Link, client: Px4Autopilot, clock: FleetClock, seconds: float) 
         ready, _, _ = select.select([link], [], [], max(until_ns - now_ns, 0) * 1e-9)
         for datagram, received_ns, address in link.receive() if ready else ():
             received += len(datagram)
-            if link.admits(address, received_ns):
-                heard = client.heard
-                client.receive(datagram, clock.at(received_ns))
-                if client.heard > heard:
-                    link.confirm(address, received_ns)
+            if link.admits(address, received_ns) and client.receive(datagram, clock.at(received_ns)).autopilot:
+                link.confirm(address, received_ns)
         for datagram in client.due(clock.now()):
             link.send(datagram)
     return received

@@ -197,11 +197,11 @@ class Supervisor:
 
     # -- what others tell ----------------------------------------------------------------------------------------------
 
-    def position_came(self) -> None:
-        """The autopilot has told a new position."""
+    def position_came(self) -> bool:
+        """The autopilot has told a new position; whether it is a jump."""
         ap = self.autopilot
         assert ap.position_ns is not None
-        self.positions.see(ap.position_ns, ap.position_ned_m, ap.velocity_ned_m_s)
+        return self.positions.see(ap.position_ns, ap.position_ned_m, ap.velocity_ned_m_s)
 
     def state(self, now: Instant) -> tuple[Ned, Ned] | None:
         """Position and velocity to steer by (fleet frame); None while there are none to trust."""

@@ -20,6 +20,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
+import typer
+
 ROOT = Path(__file__).resolve().parents[2]
 VEHICLES, VEHICLE = 16, 1
 FLIGHT_S = 40.0
@@ -59,7 +61,7 @@ def flight() -> list[tuple[str, int, int, bytes]]:
             met.append((channel, now.monotonic_ns, now.fleet_ns, body))
 
     fleet = Lockstep(parse(tables(), "tick"), seed=1, record=record)
-    fleet.run_until(READY_S, lambda: not any(v.agent.unready(fleet.now) for v in fleet.vehicles.values()))
+    fleet.run_until(READY_S, lambda: not any(v.agent.operator.unready(fleet.now) for v in fleet.vehicles.values()))
     fleet.command(b'{"verb":"takeoff"}')
     fleet.run_until(fleet.now_ns * 1e-9 + FLIGHT_S)
     boot_id = fleet.vehicles[VEHICLE].agent.boot_id
@@ -72,7 +74,7 @@ def meet(tape: Path) -> Met:
     from companion.core.values import FORMATION_PHASES, Instant
     from companion.vehicle.agent import Agent
 
-    (_, boot_id, _, _), *entries = pickle.loads(tape.read_bytes())  # noqa: S301 - written by this program
+    (_, boot_id, _, _), *entries = pickle.loads(tape.read_bytes())
     agent = Agent(parse(tables(), "tick"), VEHICLE, boot_id)
     digest = blake2b(digest_size=12)
     took: list[int] = []
@@ -113,7 +115,7 @@ def met_by(tree: Path, tape: Path) -> Met:
     done = subprocess.run(
         [sys.executable, __file__, "--meet", str(tape)], cwd=tree, env=environment, capture_output=True, check=True
     )
-    return Met(*pickle.loads(done.stdout))  # noqa: S301 - this program's own output
+    return Met(*pickle.loads(done.stdout))
 
 
 def main(against: Path | None) -> None:
@@ -125,11 +127,11 @@ def main(against: Path | None) -> None:
         rounds = [[met_by(tree, tape) for tree in trees] for _ in range(ROUNDS)]
     for tree, met in zip(trees, zip(*rounds, strict=True), strict=True):
         median = statistics.median(m.microseconds for m in met)
-        print(f"{median:7.1f} us a tick, {VEHICLES - 1} neighbours, {met[0].ticks} ticks, {ROUNDS} rounds: {tree}")
+        typer.echo(f"{median:7.1f} us a tick, {VEHICLES - 1} neighbours, {met[0].ticks} ticks, {ROUNDS} rounds: {tree}")
     if against is not None:
         ratio = statistics.median(ours.microseconds / theirs.microseconds for ours, theirs in rounds)
         same = "the same bytes" if len({m.digest for r in rounds for m in r}) == 1 else "OTHER BYTES"
-        print(f"{ratio:7.3f} of the other tree's; {same}")
+        typer.echo(f"{ratio:7.3f} of the other tree's; {same}")
 
 
 if __name__ == "__main__":

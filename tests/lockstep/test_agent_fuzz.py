@@ -37,7 +37,7 @@ IDS = itertools.count()
 
 def ordered(agent: Agent, motion: bytes) -> bytes:
     """A command to fly a motion, given at a vehicle's place."""
-    head = {"id": f"{next(IDS)}", "issuer": "x", "after": {agent.id: [agent.orders.place(agent.supervisor.begun)]}}
+    head = {"id": f"{next(IDS)}", "issuer": "x", "after": {agent.id: [agent.operator.place]}}
     return b'{"verb":"motion",%s,"motion":%s}' % (json.dumps(head)[1:-1].encode(), motion)
 
 
@@ -380,7 +380,7 @@ class Calls:
 
 
 def give(agent: Agent, given: Input, now: Instant) -> None:
-    """Hand an input to an agent as its process does, without the border that catches what raises."""
+    """Hand an input to an agent as its process does, without the guard that catches what raises."""
     match given.kind:
         case "plan" | "state":
             agent.receive_peer(given.key, given.payload, now)
@@ -391,7 +391,7 @@ def give(agent: Agent, given: Input, now: Instant) -> None:
         case "status":
             assert len(json.dumps(agent.status(now))) < 40_000
         case "preflight":
-            assert len(agent.account(now).model_dump_json()) < 40_000
+            assert len(agent.operator.preflight_report(now).model_dump_json()) < 40_000
 
 
 def flooded(seed: int, count: int) -> tuple[int, int, int]:

@@ -170,6 +170,18 @@ class ParameterReader:
         return min((next_ns for _, next_ns in waiting), default=self._round_ns)
 
 
+class Heard(NamedTuple):
+    """What one datagram brought."""
+
+    autopilot: bool
+    """a heartbeat or a position: what proves that it is our autopilot that speaks"""
+    position: bool
+    """a position newer than the one before"""
+
+
+NOTHING = Heard(autopilot=False, position=False)
+
+
 class Px4Autopilot:
     """One autopilot as seen over its link."""
 
@@ -179,8 +191,6 @@ class Px4Autopilot:
         self.link = MavlinkCodec(system_id)
         self.position_rate_hz = position_rate_hz
         self.counts = Counts(COUNTED)
-        self.heard = 0
-        """heartbeats and positions so far: what proves that it is our autopilot that speaks"""
         self.events: list[Event] = []
         """what happened; emptied by the agent"""
         self.fleet_origin = fleet_origin
@@ -232,10 +242,10 @@ class Px4Autopilot:
         self._clock_ahead_ns: deque[int] = deque(maxlen=CLOCK_SAMPLES)
         self._origin_doubted = False
 
-    def receive(self, datagram: bytes, now: Instant) -> bool:
-        """Take a datagram; True if it brought a position."""
+    def receive(self, datagram: bytes, now: Instant) -> Heard:
+        """Take a datagram; returns what it brought."""
         self._now_ns = now.monotonic_ns
-        fresh = False
+        ours = fresh = False
         foreign = self.link.foreign_heard
         messages = self.link.decode(datagram)
         if self.link.foreign_heard > foreign:
@@ -243,10 +253,10 @@ class Px4Autopilot:
         for event in messages:
             match event:
                 case wire.LocalPosition():
-                    self.heard += 1
+                    ours = True
                     fresh = self._position(event, now) or fresh
                 case wire.Heartbeat():
-                    self.heard += 1
+                    ours = True
                     self._heartbeat(event, now)
                 case wire.CurrentMode():
                     self.custom_mode = event.custom_mode
@@ -273,7 +283,7 @@ class Px4Autopilot:
                     self._clock_ahead_ns.append(event.unix_us * 1000 - now.fleet_ns)
                 case wire.CommandAnswer():
                     self._answer(event, now)
-        return fresh
+        return Heard(ours, fresh)
 
     def _heartbeat(self, event: wire.Heartbeat, now: Instant) -> None:
         first = self.heartbeat_ns is None
