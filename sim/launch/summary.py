@@ -19,7 +19,8 @@ from companion.config import FleetConfig
 from companion.core.counts import Refusal
 from companion.core.events import Event, FailsafeActed, Killed, MotionAdopted, PhaseChanged
 from companion.core.monitor import algebraic_connectivity, centroid_error_m, formation_error_m, velocity_error_m_s
-from companion.core.trajectory import FleetTrajectory, TrajectoryHistory
+from companion.core.trajectory.fleet import FleetTrajectory
+from companion.core.trajectory.history import TrajectoryHistory
 from companion.core.values import FLYING_PHASES, Phase
 from companion.errors import WireError
 from companion.io.loop import TICK_RECORD, TRAFFIC_RECORD

@@ -22,7 +22,7 @@ from companion.config import (
     udp_endpoint,
 )
 from companion.core.safety.fence import Fence
-from companion.core.trajectory import GotoLeg, TurnLeg, VelocityLeg
+from companion.core.trajectory.legs import GotoLeg, TurnLeg, VelocityLeg
 from companion.errors import ConfigError
 from sim.__main__ import _resize, plan_legs
 
