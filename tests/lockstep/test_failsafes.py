@@ -331,7 +331,7 @@ def alone_for_long() -> tuple[float, float]:
     s = scene(change=brief)
     s.ls.partition({1}, {2})
     until(s.ls, 10.0, lambda: s.phase is Phase.DETACHED)
-    s.began_s = first(s.ls, "waiting -> apart", 1)
+    s.began_s = first(s.ls, "waiting -> detached", 1)
     must_end(s, Phase.LANDED)
     return s.noted(Failsafe.ALONE_FOR_LONG), 4.0
 
