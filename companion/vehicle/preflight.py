@@ -12,7 +12,8 @@ from typing import Annotated, Any, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from companion.config import FleetConfig, Vehicle
+from companion.config import FleetConfig
+from companion.config.derived import Vehicle
 from companion.core.frames import Geodetic, Ned, geodetic_to_ned
 from companion.core.trajectory import FleetTrajectory
 from companion.wire import mavlink as wire
