@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from companion.config import read_tables
+from companion.config.file import read_tables
 from companion.errors import CompanionError, ConfigError, RefusedError
 
 app = typer.Typer(
@@ -154,7 +154,7 @@ def up(
     tables = _tables(fleet, vehicles, formation, plan)
     if calm:
         tables.setdefault("stub", {}).update(position_noise_m=0.0, velocity_noise_m_s=0.0, gust_m_s2=0.0)
-    from companion.config import parse
+    from companion.config.file import parse
 
     config = parse(tables, fleet.name)
     if len(config.vehicles) > CROWD_PER_CORE * len(os.sched_getaffinity(0)):
@@ -205,7 +205,7 @@ def stub(
 
     A vehicle's own `mavlink` URL moves both: the stub sends to that port, from 40 above it (1000 from the eleventh on).
     """
-    from companion.config import parse
+    from companion.config.file import parse
     from sim.autopilot.stub_fleet import check_stub_links, stub_settings
     from sim.autopilot.stubs import run_stubs
 
@@ -234,7 +234,7 @@ def fault(
     vehicles: Vehicles = None,
 ) -> None:
     """Have a stub autopilot of a running fleet suffer a fault; exit status 1 if it does not answer."""
-    from companion.config import parse
+    from companion.config.file import parse
     from sim.autopilot.faults import Fault, FaultKind
     from sim.launch.faults import order_fault
 
@@ -254,7 +254,7 @@ def sitl(
     ready: Annotated[Path | None, typer.Option(help="A file to make once every parameter is read back.")] = None,
 ) -> None:
     """Run PX4 SITL instances until standard input closes: for launchers."""
-    from companion.config import parse
+    from companion.config.file import parse
     from sim.launch.sitl import SitlHost, SitlSettings, check_build, parse_parameters
 
     config = parse(_tables(fleet), fleet.name)
@@ -300,7 +300,7 @@ def study(
 
 
 def _operate(fleet: Path, vehicles: int | None, verb: str, act: Callable[[Any], Any], both: bool = False) -> None:
-    from companion.config import parse
+    from companion.config.file import parse
     from companion.io.loop import network_settings
     from companion.io.zenoh_peers import OperatorLink
     from companion.operator.client import Operator
@@ -321,7 +321,7 @@ def status(
     as_json: Annotated[bool, typer.Option("--json", help="Each vehicle's own account as JSON.")] = False,
 ) -> None:
     """Each vehicle's account of itself. Exit status 1 if one is silent."""
-    from companion.config import parse
+    from companion.config.file import parse
     from companion.io.loop import network_settings
     from companion.io.zenoh_peers import OperatorLink
     from companion.operator.client import Operator
@@ -353,7 +353,7 @@ def preflight(
 
     Exit status: 0 it may, 1 it may not (each fault is named), 2 wrong usage or configuration.
     """
-    from companion.config import parse
+    from companion.config.file import parse
     from companion.io.loop import network_settings
     from companion.io.zenoh_peers import OperatorLink
     from companion.operator.client import Operator

@@ -14,7 +14,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from companion.config import FleetConfig, Vehicle
+from companion.config import FleetConfig
+from companion.config.derived import Vehicle
 from companion.errors import CompanionError
 from companion.io.clock import FleetClock
 from companion.io.link import Link, open_link

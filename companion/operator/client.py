@@ -16,7 +16,8 @@ from typing import Any, Protocol
 
 from pydantic import ValidationError
 
-from companion.config import FleetConfig, GotoLegTable
+from companion.config import FleetConfig
+from companion.config.schema import GotoLegTable
 from companion.core.frames import Ned
 from companion.core.route import only_stops
 from companion.core.trajectory.fleet import FleetTrajectory

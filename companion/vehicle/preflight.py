@@ -1,6 +1,6 @@
 """Preflight: what must be true of one vehicle before it takes off. Pure; every check is a row with its value and limit.
 
-A vehicle makes these rows of itself and takes off only if all are met, whoever asks. `preflight_fleet` compares what
+A vehicle makes these rows of itself and takes off only if all are met, whoever asks. `operator.preflight` compares what
 the vehicles say of themselves.
 """
 
@@ -12,7 +12,8 @@ from typing import Annotated, Any, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from companion.config import FleetConfig, Vehicle
+from companion.config import FleetConfig
+from companion.config.derived import Vehicle
 from companion.core.frames import Geodetic, Ned, geodetic_to_ned
 from companion.core.trajectory.fleet import FleetTrajectory
 from companion.wire import mavlink as wire

@@ -17,7 +17,8 @@ from typing import IO, Any
 import numpy as np
 import tomli_w
 
-from companion.config import FleetConfig, parse
+from companion.config import FleetConfig
+from companion.config.file import parse
 from companion.errors import CompanionError, RefusedError
 from companion.io.loop import network_settings
 from companion.io.zenoh_peers import OperatorLink

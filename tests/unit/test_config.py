@@ -12,15 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.config import (
-    FleetConfig,
-    autopilot_port,
-    companion_port,
-    load,
-    parse,
-    serial_endpoint,
-    udp_endpoint,
-)
+from companion.config import FleetConfig, load
+from companion.config.endpoints import autopilot_port, companion_port, serial_endpoint, udp_endpoint
+from companion.config.file import parse
 from companion.core.safety.fence import Fence
 from companion.core.trajectory.legs import GotoLeg, TurnLeg, VelocityLeg
 from companion.errors import ConfigError
