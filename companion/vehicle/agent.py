@@ -18,7 +18,7 @@ from companion.core.events import FailsafeNoted
 from companion.core.failsafe import LATE_S, Failsafe
 from companion.core.frames import Ned
 from companion.core.law.starling import Law, StarlingLaw
-from companion.core.neighbours import PeerTable
+from companion.core.neighbours.table import PeerTable
 from companion.core.safety.filter import SafetyFilter
 from companion.core.trajectory.fleet import Reference, TrajectoryState
 from companion.core.trajectory.history import TrajectoryHistory

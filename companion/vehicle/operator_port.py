@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 from companion.config import FleetConfig
 from companion.core.counts import Counts, Refusal
 from companion.core.frames import Ned, geodetic_to_ned
-from companion.core.neighbours import PeerTable
+from companion.core.neighbours.table import PeerTable
 from companion.core.trajectory.history import TrajectoryHistory
 from companion.core.values import FLYING_PHASES, Instant, Phase
 from companion.vehicle.autopilot.px4 import Px4Autopilot

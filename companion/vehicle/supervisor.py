@@ -39,7 +39,7 @@ from companion.core.failsafe import (
 )
 from companion.core.frames import Ned
 from companion.core.health import Debounce, PositionWatch
-from companion.core.neighbours import PeerTable
+from companion.core.neighbours.table import PeerTable
 from companion.core.phase import PhaseEvent, next_phase
 from companion.core.rejoin import RejoinTrajectory
 from companion.core.trajectory.fleet import Reference
