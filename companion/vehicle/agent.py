@@ -50,9 +50,11 @@ from companion.core.values import (
     VehicleState,
 )
 from companion.errors import ConfigError, WireError
+from companion.vehicle.autopilot.port import AutopilotPort
 from companion.vehicle.autopilot.px4 import Px4Autopilot
+from companion.vehicle.check import Check, unmet
 from companion.vehicle.orders import ORDER_FAULTS, Order, OrderBook, read_order, revision_fault
-from companion.vehicle.preflight import Check, PreflightReport, assignment_hash, own_checks, unmet
+from companion.vehicle.preflight import PreflightReport, assignment_hash, own_checks
 from companion.vehicle.supervisor import Supervisor
 from companion.wire.peer import WIRE_FAULTS, decode_motion, decode_state, encode_motion, encode_state
 
@@ -147,15 +149,14 @@ class Agent:
         self.id = vehicle_id
         self.boot_id = boot_id
         self.rejected = Counts(REJECTED)
-        origin = config.origin if config.fleet.frame == "global" else None
-        self.autopilot = Px4Autopilot(self.vehicle.system_id, origin, config.limits.control_rate_hz)
+        self.autopilot: AutopilotPort = Px4Autopilot(config, self.vehicle)
         self.history = TrajectoryHistory([config.first_motion])
         others = frozenset(v.id for v in config.vehicles) - {vehicle_id}
         self.peers = PeerTable(vehicle_id, others, config.peer_limits, self.history)
         self.law: Law = StarlingLaw(config.gains)
         """what is flown, before the filter; tests and studies may put another in its place"""
         self.safety = SafetyFilter(config.safety_limits)
-        self.supervisor = Supervisor(config, vehicle_id, self.autopilot, self.history, self.peers, self._restart_filter)
+        self.supervisor = Supervisor(config, self.autopilot, self.history, self.peers, self._restart_filter)
         self.orders = OrderBook(boot_id)
         self.trigger = config.trigger_rule
         self.near = NearMode(config.near_rate)
@@ -677,8 +678,8 @@ class Agent:
     def _observe(self, measured: tuple[Ned, Ned], dt_s: float, now: Instant) -> tuple[VehicleState, Ned]:
         """The own state without the estimator's velocity bias, and that bias; the filter for sending goes along."""
         position, velocity = measured
-        if self.supervisor.positions.jumps != self._jumps:
-            self._jumps = self.supervisor.positions.jumps
+        if self.supervisor.position_jumps != self._jumps:
+            self._jumps = self.supervisor.position_jumps
             self._bias = (BiasObserver(), BiasObserver(), BiasObserver())
             self._filter = (SendFilter(), SendFilter(), SendFilter())
         free = Ned(*(o.step(p, v, dt_s) for o, p, v in zip(self._bias, position, velocity, strict=True)))
