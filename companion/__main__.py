@@ -65,8 +65,8 @@ def check(
     usage or configuration.
     """
     from companion.io.check import hardware_checks
+    from companion.vehicle.check import unmet
     from companion.vehicle.preflight import as_json as row_json
-    from companion.vehicle.preflight import unmet
 
     config = load(fleet)
     rows = []

@@ -19,7 +19,8 @@ from companion.core.trajectory.fleet import FleetTrajectory, top_speed_m_s
 from companion.core.trajectory.successors import with_legs
 from companion.core.trajectory_check import ALTITUDE_MIN_M, PLAN_SPEED_SHARE, SPEED_SLACK
 from companion.core.values import ZERO
-from companion.vehicle.preflight import Check, PreflightReport, as_json, assignment_hash, first_formation, tidy, unmet
+from companion.vehicle.check import Check, tidy, unmet
+from companion.vehicle.preflight import PreflightReport, as_json, assignment_hash, first_formation
 
 BODY_M = 0.5
 """closer than this two vehicles touch; what is kept where the barrier is off"""

@@ -10,11 +10,12 @@ from companion.core.frames import Ned, geodetic_to_ned
 from companion.core.neighbours.table import PeerTable
 from companion.core.trajectory.history import TrajectoryHistory
 from companion.core.values import FLYING_PHASES, Instant, Phase
-from companion.vehicle.autopilot.px4 import Px4Autopilot
+from companion.vehicle.autopilot.port import AutopilotPort
+from companion.vehicle.check import Check, unmet
 from companion.vehicle.orders import ORDER_FAULTS, Order, OrderBook, Place, read_order
 from companion.vehicle.outputs import TickReport
 from companion.vehicle.plan_exchange import PlanExchange
-from companion.vehicle.preflight import Check, PreflightReport, assignment_hash, own_checks, unmet
+from companion.vehicle.preflight import PreflightReport, assignment_hash, own_checks
 from companion.vehicle.publisher import Publisher
 from companion.vehicle.supervisor import Supervisor
 from companion.wire.peer import encode_motion
@@ -44,7 +45,7 @@ class OperatorPort:
     config: FleetConfig
     vehicle_id: int
     boot_id: int
-    autopilot: Px4Autopilot
+    autopilot: AutopilotPort
     supervisor: Supervisor
     history: TrajectoryHistory
     peers: PeerTable

@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from companion.operator.preflight import Report
-from companion.vehicle.preflight import Check
+from companion.vehicle.check import Check
 from sim.launch.launch import Progress
 
 PLAIN_INTERVAL_S = 5.0

@@ -25,7 +25,8 @@ from companion.operator.client import (
     turn_leg,
     velocity_leg,
 )
-from companion.vehicle.preflight import Check, PreflightReport, assignment_hash
+from companion.vehicle.check import Check
+from companion.vehicle.preflight import PreflightReport, assignment_hash
 from companion.wire.peer import decode_motion, encode_motion
 
 CONFIG = load(Path(__file__).resolve().parents[2] / "fleet.toml", lambda t: t.update(vehicle=t["vehicle"][:4]))

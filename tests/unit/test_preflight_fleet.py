@@ -16,7 +16,8 @@ from companion.operator.preflight import (
     change_distances_m,
     fleet_report,
 )
-from companion.vehicle.preflight import Check, PreflightReport, assignment_hash, first_formation
+from companion.vehicle.check import Check
+from companion.vehicle.preflight import PreflightReport, assignment_hash, first_formation
 
 FILE = Path(__file__).resolve().parents[2] / "fleet.toml"
 
