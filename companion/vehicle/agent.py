@@ -97,7 +97,7 @@ class Agent:
         """when this agent first acted (monotonic)"""
         self._ticked_ns: int | None = None
         """when the last control tick was (monotonic)"""
-        self._report: TickReport | None = None
+        self._last_tick: TickReport | None = None
         self._neighbours: list[Neighbour] = []
         self._predict_ns = 0
         """when who does not steer predicts its peers again (monotonic)"""
@@ -187,7 +187,7 @@ class Agent:
     def status(self, now: Instant) -> dict[str, Any]:
         """What the operator's table shows; plain values."""
         up_s = 0.0 if self._began_ns is None else (now.monotonic_ns - self._began_ns) * 1e-9
-        return self.operator.status(Activity(up_s, self.setpoints_sent, self._report, dict(self.safety.counts)), now)
+        return self.operator.status(Activity(up_s, self.setpoints_sent, self._last_tick, dict(self.safety.counts)), now)
 
     # -- time ----------------------------------------------------------------------------------------------------------
 
@@ -239,7 +239,7 @@ class Agent:
         self.supervisor.settle(ego, reference, now)
         self.plans.propose(now)
         self._publish(reference, residual, now)
-        self._account(ego, reference, neighbours, came, setpoint is not None, now)
+        self._report_tick(ego, reference, neighbours, came, setpoint is not None, now)
 
     # -- the stages ----------------------------------------------------------------------------------------------------
 
@@ -304,12 +304,12 @@ class Agent:
         if self.publisher.announces and self.observer.observed_ns is not None:
             self._publish(self.history.reference(self.id, now.fleet_ns), ZERO, now)
 
-    def _account(
+    def _report_tick(
         self, ego: VehicleState, reference: Reference, neighbours: Sequence[Neighbour], came: bool, steered: bool,
         now: Instant,
     ) -> None:  # fmt: skip
         """Report what this tick did."""
-        self._report = self._outputs.tick = TickReport(
+        self._last_tick = self._outputs.tick = TickReport(
             now,
             came,
             dist(ego.position_ned_m, reference.position_ned_m),
