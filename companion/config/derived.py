@@ -363,6 +363,18 @@ class FleetConfig(FleetTables):
             _, place, velocity, _ = leg_end(leg, place, velocity)
 
     @cached_property
+    def first_formation(self) -> FleetTrajectory:
+        """The change of formation that the vehicles begin with: from their pads to the slots as all assign them."""
+        return self.motion_into(self.formation.shape, self.first_motion, self.first_motion.start_ns, 0)
+
+    @cached_property
+    def assignment_hash(self) -> str:
+        """Digest of who takes which slot of the first formation, to a millimetre."""
+        slots = self.first_formation.slots
+        text = "".join(f"{i}:{','.join(f'{x + 0.0:.3f}' for x in slots[i].after)};" for i in sorted(slots))
+        return blake2s(text.replace("-0.000", "0.000").encode(), digest_size=8).hexdigest()
+
+    @cached_property
     def shared_hash(self) -> str:
         """Digest of what the vehicles must agree on: everything but links and the stubs' noise."""
         shared = self.model_dump(exclude={"stub": True, "vehicle": {"__all__": {"mavlink", "zenoh"}}})
