@@ -516,7 +516,7 @@ class FleetConfig(_Table):
     def motion_limits(self) -> MotionLimits:
         """What every motion must keep, whoever proposes it."""
         x = self.limits
-        # Slots that change places by the assignment stay 1/sqrt(2) of their distance apart (`formation.assign`): with
+        # Slots that change places by the assignment stay 1/sqrt(2) of their distance apart (`assignment.assign`): with
         # the offsets u before and w after of a pair u.w >= 0, since exchanging the two would else cost less.
         apart_m = self.safety_radius_m / sqrt(2.0) if x.barrier else 0.0
         return MotionLimits(x.speed_max_m_s, x.climb_max_m_s, x.descent_max_m_s, apart_m, self.geofence)

@@ -13,6 +13,7 @@ from typing import Annotated, Any, NamedTuple
 from pydantic import BaseModel, ConfigDict, Field
 
 from companion.config import FleetConfig, Vehicle
+from companion.core import assignment
 from companion.core.frames import Geodetic, Ned, geodetic_to_ned
 from companion.core.trajectory import FleetTrajectory
 from companion.wire import mavlink as wire
@@ -370,9 +371,10 @@ def first_formation(config: FleetConfig, motion: FleetTrajectory) -> FleetTrajec
 
 
 def assignment_hash(config: FleetConfig) -> str:
-    """Digest of who takes which slot of the first formation, to a millimetre."""
+    """Digest of who takes which slot of the first formation, to a millimetre, and of the rule that says so."""
     slots = first_formation(config, config.first_motion).slots
     text = "".join(f"{i}:{','.join(f'{x + 0.0:.3f}' for x in slots[i].after)};" for i in sorted(slots))
+    text = f"{assignment.VERSION}|{text}"
     return blake2s(text.replace("-0.000", "0.000").encode(), digest_size=8).hexdigest()
 
 
