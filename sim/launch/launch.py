@@ -44,7 +44,7 @@ CROWD_NICENESS = 10
 """more companions than CROWD want more than two processors: they get less, each its share, and not the one process that
 simulates all autopilots, without which nobody flies"""
 AUTOPILOTS_GRACE_S = 12.0
-LIBRARIES = ("starling-fleet", "pymavlink", "eclipse-zenoh", "numpy", "scipy", "pydantic", "mcap")
+LIBRARIES = ("starling-fleet", "pymavlink", "eclipse-zenoh", "numpy", "pydantic", "mcap")
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,6 @@ import numpy.typing as npt
 
 from companion.config import FleetConfig
 from companion.core.events import Event, FailsafeActed, Killed, MotionAdopted, PhaseChanged
-from companion.core.monitor import algebraic_connectivity, centroid_error_m, formation_error_m, velocity_error_m_s
 from companion.core.trajectory import FleetTrajectory, TrajectoryHistory
 from companion.core.values import FLYING_PHASES, Phase
 from companion.errors import WireError
@@ -26,6 +25,7 @@ from companion.wire import operator as protocol
 from companion.wire.events import decode_event
 from companion.wire.mavlink import Px4Mode
 from companion.wire.peer import encode_motion
+from sim.measures import algebraic_connectivity, centroid_error_m, formation_error_m, velocity_error_m_s
 
 Array = npt.NDArray[Any]
 SETTLING_S = 3.0

@@ -11,7 +11,7 @@ from fleet_process import make_fleet
 from px4_fleet import ALTITUDE_M, Flying, flying
 from slow_link import slow_link
 
-from companion.core.monitor import formation_error_m
+from sim.measures import formation_error_m
 
 COUNT = 3
 SLOW_S = 0.060
