@@ -23,8 +23,8 @@ from companion.io.loop import network_settings
 from companion.io.zenoh_peers import OperatorLink
 from companion.vehicle.autopilot.port import AutopilotPort
 from companion.vehicle.autopilot.px4 import Px4Autopilot
-from companion.vehicle.check import Check, tidy
 from companion.vehicle.preflight import own_checks
+from companion.wire.operator import Check, tidy
 
 FREE_LEAST_GB = 1.0
 """a recording takes 25 MB for half an hour; nobody deletes the old ones"""

@@ -10,7 +10,6 @@ the part that does it: `observer`, `supervisor`, `peers`, `plans`, `publisher`, 
 from collections.abc import Sequence
 from math import dist
 from random import Random
-from typing import Any
 
 from companion.config import FleetConfig
 from companion.core.counts import Counts
@@ -44,6 +43,7 @@ from companion.vehicle.outputs import Outputs, TickReport
 from companion.vehicle.plan_exchange import PlanExchange
 from companion.vehicle.publisher import OwnState, Publisher
 from companion.vehicle.supervisor import Supervisor
+from companion.wire.operator import Status
 from companion.wire.peer import WIRE_FAULTS, decode_state
 
 TIMER_SLACK = 2.5
@@ -184,8 +184,8 @@ class Agent:
         """The process is asked to end: land. `stopped` tells when the autopilot has taken over."""
         self.supervisor.land(now)
 
-    def status(self, now: Instant) -> dict[str, Any]:
-        """What the operator's table shows; plain values."""
+    def status(self, now: Instant) -> Status:
+        """This vehicle's account of itself, but for what only its process knows."""
         up_s = 0.0 if self._began_ns is None else (now.monotonic_ns - self._began_ns) * 1e-9
         return self.operator.status(Activity(up_s, self.setpoints_sent, self._last_tick, dict(self.safety.counts)), now)
 

@@ -5,19 +5,14 @@ the vehicles say of themselves.
 """
 
 from dataclasses import replace
-from hashlib import blake2s
 from math import hypot
-from typing import Annotated, Any
-
-from pydantic import BaseModel, ConfigDict, Field
 
 from companion.config import FleetConfig
 from companion.config.derived import Vehicle
 from companion.core.failsafe import ACCURACY_LIMIT_M, HEARTBEAT_S, STALE_S
 from companion.core.frames import Ned, geodetic_to_ned
-from companion.core.trajectory.fleet import FleetTrajectory
 from companion.vehicle.autopilot.port import AutopilotFacts
-from companion.vehicle.check import Check, tidy
+from companion.wire.operator import Check, tidy
 
 
 def own_checks(
@@ -170,65 +165,3 @@ def _start_checks(facts: AutopilotFacts, config: FleetConfig, place: Ned) -> lis
 
 def _level(p: Ned) -> float:
     return hypot(p.north, p.east)
-
-
-def first_formation(config: FleetConfig, motion: FleetTrajectory) -> FleetTrajectory:
-    """The change of formation that the vehicles begin with from a motion: pads to slots, as they assign them."""
-    return config.motion_into(config.formation.shape, motion, motion.start_ns, 0)
-
-
-def assignment_hash(config: FleetConfig) -> str:
-    """Digest of who takes which slot of the first formation, to a millimetre."""
-    slots = first_formation(config, config.first_motion).slots
-    text = "".join(f"{i}:{','.join(f'{x + 0.0:.3f}' for x in slots[i].after)};" for i in sorted(slots))
-    return blake2s(text.replace("-0.000", "0.000").encode(), digest_size=8).hexdigest()
-
-
-# Bounds that every true answer keeps by far, and within which what is computed from it cannot overflow.
-_Coordinate = Annotated[float, Field(ge=-1e8, le=1e8, allow_inf_nan=False)]
-_Id = Annotated[int, Field(ge=0, le=255)]
-_Word = Annotated[str, Field(max_length=64)]
-_Unsigned32 = Annotated[int, Field(ge=0, lt=1 << 32)]
-_TimeNs = Annotated[int, Field(ge=0, lt=1 << 63)]
-_Place = tuple[_Coordinate, _Coordinate, _Coordinate]
-
-
-class PreflightReport(BaseModel):
-    """What a vehicle answers to a preflight question: its own rows, and the facts that only a comparison can judge."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore")
-
-    vehicle: _Id
-    boot_id: _Unsigned32
-    system_id: _Id
-    configuration: _Word
-    assignment: _Word
-    flying: bool
-    """whether it flies on its companion's command"""
-    revision: _Unsigned32
-    """of its newest motion"""
-    position_ned_m: _Place | None
-    """fleet frame"""
-    slot_ned_m: _Place
-    """where its motion wants it now, fleet frame"""
-    origin_ned_m: _Place | None
-    """its estimator's origin in the fleet frame; None in a local frame, and while unknown"""
-    home_altitude_amsl_m: _Coordinate | None
-    own_id_heard: bool = False
-    """whether somebody else speaks under its id"""
-    checks: tuple[Check, ...]
-
-
-class ClockReading(BaseModel):
-    """A vehicle's fleet time at a question's arrival and at its answer."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore")
-
-    boot_id: _Unsigned32
-    received_ns: _TimeNs
-    answered_ns: _TimeNs
-
-
-def as_json(check: Check) -> dict[str, Any]:
-    """A row as JSON carries it."""
-    return {name: getattr(check, name) for name in Check.__dataclass_fields__}

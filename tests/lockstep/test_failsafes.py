@@ -92,7 +92,7 @@ class Scene:
         return self.ls.vehicles[1].agent.phase
 
     def count(self, failsafe: Failsafe) -> int:
-        told = self.ls.vehicles[1].agent.status(self.ls.now)["rejected"]
+        told = self.ls.vehicles[1].agent.status(self.ls.now).rejected
         return int(told.get(failsafe.value, 0))
 
     def after(self, text: str) -> float:
@@ -483,7 +483,7 @@ def battery_unknown() -> tuple[float, float]:
     s.ls.vehicles[1].autopilot.inject(Fault(FaultKind.LOW_BATTERY, 0.5))
     wait(s.ls, 6.0)
     assert s.count(Failsafe.BATTERY_UNKNOWN) == 1
-    assert s.ls.vehicles[1].agent.status(s.ls.now)["battery_percent"] == -1
+    assert s.ls.vehicles[1].agent.status(s.ls.now).battery_percent == -1
     must_go_on(s, Phase.WAITING)
     return s.after(Failsafe.BATTERY_UNKNOWN.value), 5.0
 
@@ -547,7 +547,7 @@ def not_finite() -> tuple[float, float]:
     boot_ms = agent.autopilot.boot.last_boot_ms + 1
     message = dialect.MAVLink_local_position_ned_message(boot_ms, float("nan"), 0.0, 0.0, 0.0, 0.0, 0.0)
     agent.receive_mavlink(bytes(message.pack(WORLD)), s.ls.now)
-    assert agent.status(s.ls.now)["rejected"]["not finite"] == 1
+    assert agent.status(s.ls.now).rejected["not finite"] == 1
     must_go_on(s, Phase.WAITING)
     return 0.0, 0.0
 

@@ -9,6 +9,7 @@ import pytest
 from companion.config import load
 from companion.core.values import Instant, Phase
 from companion.vehicle.agent import Agent
+from companion.wire.operator import encode
 from companion.wire.peer import encode_motion
 
 CONFIG = load(Path(__file__).resolve().parents[2] / "fleet.toml", lambda t: t.update(vehicle=t["vehicle"][:2]))
@@ -82,9 +83,9 @@ def test_the_report_and_the_status_tell_the_same_of_one_vehicle() -> None:
     later = Instant(NOW.monotonic_ns + 2_000_000_000, NOW.fleet_ns + 2_000_000_000)
     report, status = a.operator.preflight_report(later), a.status(later)
     assert (report.vehicle, report.boot_id, report.configuration) == (1, 7, CONFIG.shared_hash)
-    assert status["configuration"] == report.configuration
-    assert status["ready"] == [c.message for c in report.checks if not c.passed]
-    assert set(status["unfit"]) <= set(status["ready"])
-    assert status["up_s"] == 2.0
-    assert status["place"] == [7, 0, 0]
-    assert json.loads(json.dumps(status))["motion"] == json.loads(encode_motion(a.history.newest))
+    assert status.configuration == report.configuration
+    assert status.ready == [c.message for c in report.checks if not c.passed]
+    assert set(status.unfit) <= set(status.ready)
+    assert status.up_s == 2.0
+    assert status.place == (7, 0, 0)
+    assert json.loads(encode(status))["motion"] == json.loads(encode_motion(a.history.newest))

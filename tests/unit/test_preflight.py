@@ -12,8 +12,8 @@ from companion.config import FleetConfig, load
 from companion.core.frames import Geodetic, Ned, ned_to_geodetic
 from companion.vehicle.autopilot.port import AutopilotFacts, Estimate
 from companion.vehicle.autopilot.px4_parameters import PARAMETERS, identity_checks, parameter_checks, parameter_rules
-from companion.vehicle.check import Check, unmet
-from companion.vehicle.preflight import PreflightReport, assignment_hash, own_checks
+from companion.vehicle.preflight import own_checks
+from companion.wire.operator import Check, PreflightReport, decode, encode, unmet
 
 FILE = Path(__file__).resolve().parents[2] / "fleet.toml"
 PAD = Ned(2.0, -8.0, 0.0)
@@ -268,17 +268,23 @@ def test_an_account_survives_its_journey() -> None:
     rows = own_checks(said.judged(CONFIG), CONFIG, CONFIG.vehicles[0], PAD)
     account = PreflightReport(
         vehicle=1, boot_id=7, system_id=1, configuration="c", assignment="a", flying=False, revision=0,
-        position_ned_m=PAD, slot_ned_m=PAD, origin_ned_m=None, home_altitude_amsl_m=None, checks=rows,
+        position_ned_m=PAD, slot_ned_m=PAD, origin_ned_m=None, home_altitude_amsl_m=None, own_id_heard=False,
+        checks=rows,
     )  # fmt: skip
-    again = PreflightReport.model_validate_json(account.model_dump_json())
+    again = decode(PreflightReport, encode(account))
     assert again == account
     assert isinstance(again.checks[0], Check)
 
 
 def test_the_assignments_hash_follows_slots_and_vehicles() -> None:
-    assert assignment_hash(CONFIG) == assignment_hash(config(battery_min_percent=50.0))
-    wider = CONFIG.model_copy(update={"formation": CONFIG.formation.model_copy(update={"spacing_m": 5.0})})
-    assert assignment_hash(wider) != assignment_hash(CONFIG)
+    assert CONFIG.assignment_hash == config(battery_min_percent=50.0).assignment_hash
+
+    def widen(tables: dict[str, Any]) -> None:
+        tables["vehicle"] = tables["vehicle"][:3]
+        tables["formation"]["spacing_m"] = 5.0
+
+    wider = load(FILE, widen)
+    assert wider.assignment_hash != CONFIG.assignment_hash
 
 
 def test_the_name_under_which_this_px4_has_a_setting_is_enough_and_one_is_needed() -> None:

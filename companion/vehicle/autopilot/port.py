@@ -15,7 +15,7 @@ from companion.core.events import Event
 from companion.core.failsafe import ACCURACY_LIMIT_M
 from companion.core.frames import Geodetic, Ned
 from companion.core.values import Instant, SafeSetpoint
-from companion.vehicle.check import Check
+from companion.wire.operator import Check
 
 
 class FlightMode(NamedTuple):

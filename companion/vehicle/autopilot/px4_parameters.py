@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 from companion.config import FleetConfig
 from companion.vehicle.autopilot.px4_versions import same_setting
-from companion.vehicle.check import Check, tidy
 from companion.wire import mavlink as wire
+from companion.wire.operator import Check, tidy
 
 ROUNDING = 1e-6
 """relative: PX4's parameters are float32"""
