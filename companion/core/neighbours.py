@@ -16,10 +16,10 @@ from companion.core.failsafe import FROZEN_S, SUSPECT_S, Failsafe
 from companion.core.frames import Ned
 from companion.core.health import MOVING_M_S
 from companion.core.monitor import PeerMotion
-from companion.core.near import near_bound_m
 from companion.core.prediction import HoldKind, axis, weights
 from companion.core.safety.filter import DOWNWASH_RATIO
 from companion.core.trajectory import Reference, TrajectoryHistory, TrajectoryState
+from companion.core.trigger.near import near_bound_m
 from companion.core.values import (
     AIRBORNE_PHASES,
     FILTERED_PHASES,
@@ -210,6 +210,8 @@ class _Peer:
     """until then another place of it is not noted again: a liar writes no log"""
     due_soon: bool = False
     """its last message came in near mode, so that one that is missing is known to be"""
+    told: tuple[float, ...] = ()
+    """what its law said in that message"""
 
 
 @dataclass(slots=True)
@@ -243,7 +245,8 @@ class PeerTable:
         if reason is None:
             reason = self._hear(self._peers[sample.vehicle_id], sample, message.boot_id, now)
             if reason is None:
-                self._peers[sample.vehicle_id].due_soon = message.due_soon
+                peer = self._peers[sample.vehicle_id]
+                peer.due_soon, peer.told = message.due_soon, message.told
         if reason is not None:
             self.rejected[reason] += 1
             return reason
@@ -649,6 +652,7 @@ class PeerTable:
             other_end,
             reference.velocity_ned_m_s,
             reference.acceleration_ned_m_s2,
+            peer.told,
         )
 
     def _lost_piece(self, track: _Track, ego_ned_m: Ned, now: Instant) -> tuple[Ned, Ned, Ned]:

@@ -19,8 +19,6 @@ from companion.core.estimate import BiasObserver, SendFilter
 from companion.core.events import Event, MotionAdopted
 from companion.core.failsafe import LATE_S, Failsafe
 from companion.core.frames import Ned, geodetic_to_ned
-from companion.core.law.starling import Law, StarlingLaw
-from companion.core.near import PUSH_M_S2, NearMode, near_push_m_s2
 from companion.core.neighbours import PeerTable, predict_sample
 from companion.core.safety.filter import SafetyFilter, push_m_s2
 from companion.core.trajectory import (
@@ -34,7 +32,8 @@ from companion.core.trajectory import (
     with_legs,
 )
 from companion.core.trajectory_check import Fault, examine
-from companion.core.trigger import Situation
+from companion.core.trigger.base import Situation
+from companion.core.trigger.near import PUSH_M_S2, NearMode, near_push_m_s2
 from companion.core.values import (
     AIRBORNE_PHASES,
     FILTERED_PHASES,
@@ -42,6 +41,7 @@ from companion.core.values import (
     FORMATION_PHASES,
     SETTLED_PHASES,
     ZERO,
+    Command,
     Instant,
     Neighbour,
     PeerMessage,
@@ -53,6 +53,7 @@ from companion.core.values import (
 from companion.errors import ConfigError, WireError
 from companion.vehicle.autopilot.client import AutopilotClient
 from companion.vehicle.flight import Flight
+from companion.vehicle.guest import GUESTS, law_of, trigger_of
 from companion.vehicle.orders import ORDER_FAULTS, Order, OrderBook, read_order, revision_fault
 from companion.vehicle.preflight import Check, PreflightReport, assignment_hash, own_checks, unmet
 from companion.wire.mavlink import MavlinkCodec, mode_name
@@ -84,6 +85,7 @@ PLAN_COPIES = 2
 REJECTED = (
     "peer: unknown topic",
     "state: id is not the key's",
+    "state: of another law",
     *(f"{topic}: {kind}" for topic in ("state", "plan") for kind in WIRE_FAULTS),
     *(f"plan: {kind}" for kind in RefusalKind),
     "plan: foreign id",
@@ -91,6 +93,7 @@ REJECTED = (
     "plan: more than can be examined",
     *(f"command: {kind}" for kind in (*ORDER_FAULTS, "motion", "more than can be examined")),
     *(failsafe.value for failsafe in Failsafe),
+    *GUESTS,
 )
 """what an agent counts"""
 CAUSES = ("first", "announced", "heartbeat", "triggered", "near")
@@ -152,12 +155,12 @@ class Agent:
         self.history = TrajectoryHistory([config.first_motion])
         others = frozenset(v.id for v in config.vehicles) - {vehicle_id}
         self.peers = PeerTable(vehicle_id, others, config.peer_limits, self.history)
-        self.law: Law = StarlingLaw(config.gains)
+        self.law = law_of(config, self.rejected)
         """what is flown, before the filter; tests and studies may put another in its place"""
         self.safety = SafetyFilter(config.safety_limits)
         self.flight = Flight(config, vehicle_id, self.autopilot, self.history, self.peers, self._restart_filter)
         self.orders = OrderBook(boot_id)
-        self.trigger = config.trigger_rule
+        self.trigger = trigger_of(config, self.rejected)
         self.near = NearMode(config.near_rate)
         self.messages_sent = 0
         self.sent_because: Counter[str] = Counter(dict.fromkeys(CAUSES, 0))
@@ -183,6 +186,7 @@ class Agent:
         self._sent: tuple[PeerSample, tuple[Ned, Ned]] | None = None
         """last sample sent, with p_ref and v_d at its time"""
         self._sent_ns = 0
+        self._told: tuple[float, ...] = ()
         self._silence_limit_s = 0.0
         self._resend_ns: list[int] = []
         self._plan_due_ns: int | None = None
@@ -245,6 +249,9 @@ class Agent:
             return
         if key.split("/")[-2:-1] != [str(message.sample.vehicle_id)]:
             self.rejected["state: id is not the key's"] += 1
+            return
+        if len(message.told) != len(self.law.fields):
+            self.rejected["state: of another law"] += 1
             return
         if self.peers.accept(message, now) is None:
             if self.id in message.near_ids:
@@ -659,8 +666,8 @@ class Agent:
         residual = ZERO
         steered = False
         if steers:
-            command, residual = self.law.command(ego, reference, neighbours, alone=self.flight.alone)
-            setpoint = self.safety.apply(command, ego, neighbours, bias, dt_s)
+            wanted, residual = self.law.command(ego, reference, neighbours, alone=self.flight.alone)
+            setpoint = self.safety.apply(Command(wanted, *reference), ego, neighbours, bias, dt_s)
             if setpoint is not None:
                 self._outputs.mavlink.append(self._encode(setpoint))
                 self.setpoints_sent += 1
@@ -695,8 +702,9 @@ class Agent:
         return VehicleState(now.fleet_ns, position, free), Ned(*(o.bias_m_s for o in self._bias))
 
     def _restart_filter(self) -> None:
-        """Whatever filter flies starts anew, as the vehicle does: it is the agent's, and nobody else holds it."""
+        """Whatever filter and law fly start anew, as the vehicle does: they are the agent's, nobody else holds them."""
         self.safety.reset()
+        self.law.reset()
 
     def _encode(self, s: SafeSetpoint) -> bytes:
         frame = self.autopilot.frame
@@ -749,14 +757,14 @@ class Agent:
             return
         sample = PeerSample(self.id, now.fleet_ns, position, velocity, self.history.newest.revision, self.phase)
         self._sent = (sample, self._reference_of(sample))
-        self._sent_ns = now.monotonic_ns
+        self._sent_ns, self._told = now.monotonic_ns, self.law.tell()
         self._silence_limit_s = self._spacing.t_max_s * (0.8 + 0.2 * self._random.random())
         self._sequence = (self._sequence + 1) % (1 << 32)
         self.near.promised = near
         newest = self.history.newest
         message = PeerMessage(
             self.boot_id, self._sequence, newest.start_ns, newest.issuer, sample, self.peers.digest(),
-            near_ids=self.near.peers(now.monotonic_ns) if near else (), due_soon=near,
+            near_ids=self.near.peers(now.monotonic_ns) if near else (), due_soon=near, told=self._told,
         )  # fmt: skip
         self._outputs.peers.append(("state", encode_state(message)))
         self.messages_sent += 1
@@ -798,6 +806,8 @@ class Agent:
             0.0 if since_ns is None else (now.fleet_ns - since_ns) * 1e-9,
             now.monotonic_ns + shift_ns,
             self._sent_ns + shift_ns,
+            self._told,
+            self.law.tell(),
         )
 
     # -- telling the operator ----------------------------------------------------------------------------------------

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from companion.core.formation import shape_slots
 from companion.core.frames import Ned
 from companion.core.monitor import PeerMotion, unheard_error_m
-from companion.core.near import MISSING_MAX_M, certain_age_s
 from companion.core.neighbours import (
     FUTURE_LIMIT_S,
     GATE_RESIDUAL_M,
@@ -26,6 +25,7 @@ from companion.core.neighbours import (
 from companion.core.prediction import HoldKind
 from companion.core.safety.filter import nearest_hypothesis
 from companion.core.trajectory import FleetTrajectory, SlotChange, TrajectoryHistory, TurnLeg, VelocityLeg, with_legs
+from companion.core.trigger.near import MISSING_MAX_M, certain_age_s
 from companion.core.values import Instant, Neighbour, PeerMessage, PeerSample, Phase
 
 PROPERTY = settings(deadline=None, max_examples=60)
