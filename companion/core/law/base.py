@@ -9,7 +9,7 @@ from typing import NamedTuple, Protocol
 
 from companion.core.frames import Ned
 from companion.core.trajectory import Reference
-from companion.core.values import Neighbour, VehicleState
+from companion.core.values import Command, Neighbour, VehicleState
 
 FIELDS_MAX = 8
 """most numbers that a law adds to a message: 4 B each, in every message"""
@@ -22,6 +22,10 @@ class Wanted(NamedTuple):
     """before the safety filter; only the level part is flown, since altitude is flown by position"""
     residual_ned_m: Ned
     """mean of p_i - p^_j - d_ij over the neighbours in formation, which the trigger looks at"""
+
+    def command(self, reference: Reference) -> Command:
+        """What the safety filter is given: place, speed and heading are those of the plan, whatever the law."""
+        return Command(self.acceleration_ned_m_s2, *reference)
 
 
 class Law(Protocol):
