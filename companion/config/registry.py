@@ -7,18 +7,19 @@ name, its version and the digest of its files are part of the fleet's shared has
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from hashlib import blake2s
-from importlib.metadata import EntryPoint, entry_points
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError
 
 from companion.config.numbers import Table
 from companion.errors import ConfigError
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 
 class KindTable(Table):
@@ -55,7 +56,7 @@ class Registry(Generic[T]):
 
     def known(self) -> tuple[str, ...]:
         """Every kind: ours, then those of installed packages."""
-        added = {p.name for p in entry_points(group=self.group)} - self._ours.keys()
+        added = {p.name for p in _entry_points(self.group)} - self._ours.keys()
         return (*self._ours, *sorted(added))
 
     def table(self, kind: str) -> type[T] | None:
@@ -64,7 +65,7 @@ class Registry(Generic[T]):
         if kind in self._ours:
             return self._ours[kind]
         if kind not in self._found:
-            points = list(entry_points(group=self.group, name=kind))
+            points = [p for p in _entry_points(self.group) if p.name == kind]
             if not points:
                 return None
             self._found[kind] = self._load(points)
@@ -103,7 +104,7 @@ class Registry(Generic[T]):
             other.model_validate_json(json.dumps({k: v for k, v in beside.items() if k in other.model_fields}))
         return made
 
-    def _load(self, points: list[EntryPoint]) -> tuple[type[T], Origin]:
+    def _load(self, points: list["EntryPoint"]) -> tuple[type[T], Origin]:
         point = points[0]
         packages = sorted({p.dist.name for p in points if p.dist is not None})
         if len(packages) != 1 or point.dist is None:
@@ -120,8 +121,17 @@ class Registry(Generic[T]):
         return table, Origin(self.group, point.name, packages[0], point.dist.version, source_hash(point.module))
 
 
+def _entry_points(group: str) -> "Iterable[EntryPoint]":
+    """Those of the installed packages; what finds them costs a third of a companion's start, and is rarely wanted."""
+    from importlib.metadata import entry_points
+
+    return entry_points(group=group)
+
+
 def source_hash(module: str) -> str:
     """A digest of every file of the package in which a module lies, of names and contents."""
+    from importlib.util import find_spec
+
     spec = find_spec(module.partition(".")[0])
     digest = blake2s(digest_size=8)
     if spec is None:

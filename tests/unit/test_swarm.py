@@ -24,6 +24,7 @@ from companion.core.trigger.periodic import PeriodicTrigger
 from companion.core.trigger.switching import SwitchingTrigger
 from companion.core.values import ZERO, Command, Neighbour, PeerSample, Phase, VehicleState
 from companion.errors import ConfigError
+from sim.swarm.rows import CompiledLaw, as_rows
 from sim.swarm.swarm import (
     Formation,
     NeighbourList,
@@ -69,19 +70,6 @@ def a_neighbour(rng: np.random.Generator, k: int, scale: float, uncertainty_m: f
     )  # fmt: skip
 
 
-def as_rows(neighbours: list[Neighbour]) -> np.ndarray:
-    """The same as the kernels keep them."""
-    rows = np.zeros((max(len(neighbours), 1), kernels().ROW))
-    for row, n in zip(rows, neighbours, strict=False):
-        last = n.last_seen_ned_m
-        row[:] = (
-            *n.position_ned_m, *n.velocity_ned_m_s, *n.offset_ned_m, n.in_formation, n.shares_avoidance,
-            n.uncertainty_m, last is not None, *(last or (0.0, 0.0, 0.0)), *n.reference_velocity_ned_m_s,
-            *n.reference_acceleration_ned_m_s2,
-        )  # fmt: skip
-    return rows
-
-
 LAWS_FLOWN = {
     "flown": law.Gains(3.0, 3.0, 4.0, 1.0, 0.3, 1.2, 5.0, 1.0, 1.0, 1.0, vertical=0.0),
     "in space": law.Gains(3.0, 6.7, 5.6, 1.0, 0.3, 1.2, 5.0, 1.0, 1.0, 1.0),
@@ -92,7 +80,6 @@ LAWS_FLOWN = {
 @MANY
 def test_the_law_that_is_flown_is_the_one_that_is_compiled(states: int) -> None:
     """Any number of neighbours, lost ones too: all but the rounding of the sums, 1e-9 of what is summed."""
-    loops = kernels()
     rng = np.random.default_rng(states)
     for k in range(states):
         gains = list(LAWS_FLOWN.values())[k % 3]
@@ -102,8 +89,8 @@ def test_the_law_that_is_flown_is_the_one_that_is_compiled(states: int) -> None:
         around = [a_neighbour(rng, j, scale, 0.35) for j in range(int(rng.integers(0, 16)))]
         alone = bool(rng.random() < 0.1)
         wanted, residual = law.StarlingLaw(gains).command(ego, reference, around, alone=alone)
-        sums = loops.sums_over(ego, reference.velocity_ned_m_s, as_rows(around), len(around), alone, gains)
-        u, mean = loops.combine(sums, ego, reference, gains), loops.mean_residual(sums)
+        u, mean = CompiledLaw(gains).command(ego, reference, around, alone=alone)
+        sums = law.sums_over(ego, reference.velocity_ned_m_s, around, alone, gains)
         size = 1.0 + max(map(abs, (*sums, *wanted)))
         assert math.dist(u, wanted) <= 1e-9 * size
         assert math.dist(mean, residual) <= 1e-9 * size
