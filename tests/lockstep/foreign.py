@@ -1,4 +1,4 @@
-"""The examples' package beside ours, as an installer leaves it: its modules, and a dist-info made of its pyproject.toml.
+"""The examples' package beside ours, as an installer leaves it: its modules, and a dist-info of its pyproject.toml.
 
 No installer runs, since what builds a wheel need not be there, nor a network to fetch it.
 """
