@@ -80,6 +80,11 @@ def kernel(function: F) -> F:
     return cast(F, numba.njit(cache=True, fastmath=FAST, error_model="numpy")(function))
 
 
+def inlined(function: F) -> F:
+    """A part of a kernel that is called for each agent: a call would hand over, and count, every array of the state."""
+    return cast(F, numba.njit(fastmath=FAST, error_model="numpy", inline="always")(function))
+
+
 _share = compiled(law._share)
 within_budget = compiled(law.within_budget, _share=_share)
 pair = compiled(law.pair)
@@ -407,7 +412,7 @@ def filter_own(k: int, s: State, o: Options) -> None:
                 )
 
 
-@kernel
+@inlined
 def compose(i: int, k: int, s: State, ref: Floats, o: Options) -> None:
     """The sample that agent i would send now, into s.sent."""
     m = i if ref.shape[1] > 1 else 0
@@ -426,7 +431,7 @@ def compose(i: int, k: int, s: State, ref: Floats, o: Options) -> None:
     s.sent_step[i] = k
 
 
-@kernel
+@inlined
 def fires(i: int, k: int, s: State, o: Options, et: ErrorTrigger, st: SwitchingTrigger, it: IntentTrigger) -> bool:
     """Whether agent i's trigger asks for a message at step k; heartbeat and t_min come on top."""
     t = k * o.dt
@@ -512,7 +517,7 @@ def send(
             _digest(i, at, k, s, o)
 
 
-@kernel
+@inlined
 def _digest(i: int, at: int, k: int, s: State, o: Options) -> None:
     """The newest samples that agent i holds of others, newest first."""
     bound = k + 1
@@ -698,7 +703,7 @@ def constrain(
     )
 
 
-@kernel
+@inlined
 def look(i: int, k: int, own: Floats, common: Ned, s: State, ref: Floats, o: Options) -> int:
     """What agent i knows of its neighbours, into s.near; returns how many there are.
 
@@ -753,7 +758,7 @@ def look(i: int, k: int, own: Floats, common: Ned, s: State, ref: Floats, o: Opt
     return count
 
 
-@kernel
+@inlined
 def reread(i: int, count: int, own: Floats, s: State, o: Options, g: Gains) -> tuple[float, float, float]:
     """What other readings of Eq. (2) add to the separation: distances between true positions, other forms of phi_s."""
     sx, sy, sz = 0.0, 0.0, 0.0
@@ -774,7 +779,7 @@ def reread(i: int, count: int, own: Floats, s: State, o: Options, g: Gains) -> t
     return sx, sy, sz
 
 
-@kernel
+@inlined
 def agree(i: int, count: int, dt: float, s: State, o: Options) -> None:
     """One step of the estimate of the common velocity (`core.law.consensus`)."""
     n, x, y, z = 0.0, 0.0, 0.0, 0.0
@@ -790,7 +795,7 @@ def agree(i: int, count: int, dt: float, s: State, o: Options) -> None:
     s.common[i, 2] += dt * r2
 
 
-@kernel
+@inlined
 def intended(
     i: int, k: int, count: int, dt: float, ego: VehicleState, v_d: Ned, sums: Sums, s: State, ref: Floats, o: Options,
     g: Gains, ig: IntentGains,
