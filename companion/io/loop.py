@@ -6,6 +6,7 @@ follow from; what can wait (records, replies) is done after them.
 """
 
 import gc
+import json
 import os
 import secrets
 import select
@@ -116,6 +117,8 @@ class Companion:
             self.recorder: Recorder | None = None
             if settings.record is not None:
                 facts = {**metadata, "vehicle_id": str(settings.vehicle_id), "boot_id": str(self.boot_id)}
+                if config.foreign:
+                    facts["foreign"] = json.dumps([o._asdict() for o in config.foreign])
                 try:
                     self.recorder = Recorder(settings.record, facts)
                 except OSError as error:
