@@ -48,8 +48,7 @@ from companion.core.values import (
     VehicleState,
 )
 from companion.errors import ConfigError, WireError
-from companion.vehicle.autopilot.port import AutopilotPort
-from companion.vehicle.autopilot.px4 import Px4Autopilot
+from companion.vehicle.autopilot.adapters import open_autopilot
 from companion.vehicle.orders import ORDER_FAULTS, OrderBook
 from companion.vehicle.preflight import own_checks
 from companion.vehicle.supervisor import Supervisor
@@ -155,7 +154,7 @@ class Agent:
         self.id = vehicle_id
         self.boot_id = boot_id
         self.rejected = Counts(REJECTED)
-        self.autopilot: AutopilotPort = Px4Autopilot(config, self.vehicle)
+        self.autopilot = open_autopilot(config, self.vehicle)
         self.history = TrajectoryHistory([config.first_motion])
         others = frozenset(v.id for v in config.vehicles) - {vehicle_id}
         self.peers = PeerTable(vehicle_id, others, config.peer_limits, self.history)
