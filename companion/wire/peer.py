@@ -31,7 +31,17 @@ from companion.core.motion_check import (
     VEHICLES_MAX,
     VELOCITY_MAX_M_S,
 )
-from companion.core.plan import BLEND_MIN_S, GOTO_MIN_S, GotoLeg, Leg, Motion, SlotChange, TurnLeg, VelocityLeg
+from companion.core.plan import (
+    BLEND_MIN_S,
+    GOTO_MIN_S,
+    REVISIONS,
+    GotoLeg,
+    Leg,
+    Motion,
+    SlotChange,
+    TurnLeg,
+    VelocityLeg,
+)
 from companion.core.values import PeerMessage, PeerSample, Phase
 from companion.errors import WireError
 
@@ -142,7 +152,7 @@ class _GotoLeg(_Model):
 
 class _Motion(_Model):
     version: Literal[3]
-    revision: Annotated[int, Field(ge=0, lt=1 << 32)]
+    revision: Annotated[int, Field(ge=0, lt=REVISIONS)]
     start_ns: Annotated[int, Field(ge=0, lt=1 << 63)]
     issuer: Annotated[int, Field(ge=0, le=255)]
     shape: Annotated[str, Field(max_length=32)]
