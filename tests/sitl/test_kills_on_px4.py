@@ -42,8 +42,8 @@ def test_a_fleet_killed_by_its_operator_in_flight_falls_and_the_flight_fails(tmp
     assert summary["passed"] is False
     (kill,) = (c for c in summary["commands"] if c["verb"] == "kill")
     assert kill["accepted"] == flight.fleet.ids
-    assert "2 killed" in flight.up.err
-    assert KillCause.COMMAND.value in flight.up.out
+    assert f"vehicle 1: {KillCause.COMMAND.value}" in flight.up.err
+    assert f"vehicle 1: {KillCause.COMMAND.value}" in flight.up.out
 
 
 def test_a_px4_that_dies_in_flight_is_told_on_the_screen_and_in_the_summary_and_blocks_nobody(
