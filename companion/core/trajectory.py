@@ -390,6 +390,10 @@ class TrajectoryState(NamedTuple):
         )
 
 
+REVISIONS = 1 << 32
+"""a motion's revision is below this, as it travels"""
+
+
 def motion_order(revision: int, start_ns: int, issuer: int) -> tuple[int, int, int]:
     """What `FleetTrajectory.order` is, of a motion that is only named."""
     return (revision, -start_ns, issuer)

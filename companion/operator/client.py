@@ -19,7 +19,7 @@ from pydantic import ValidationError
 from companion.config import FleetConfig, GotoLegTable
 from companion.core.frames import Ned
 from companion.core.route import only_stops
-from companion.core.trajectory import FleetTrajectory, Leg, TurnLeg, VelocityLeg, with_legs
+from companion.core.trajectory import REVISIONS, FleetTrajectory, Leg, TurnLeg, VelocityLeg, with_legs
 from companion.core.trajectory_check import examine
 from companion.core.values import ZERO
 from companion.errors import RefusedError, WireError
@@ -36,8 +36,6 @@ ENDING_TIMEOUTS_S = (1.0, 1.0, 2.0, 1.0)
 """what ends a flight is commanded anew after these, to whoever is silent or has begun another flight meanwhile"""
 MOTION_AHEAD_NS = 3_600_000_000_000
 """a motion that begins later than this is nobody's: no vehicle takes one"""
-REVISIONS = 1 << 32
-"""of motions, on the wire"""
 STATUS_TIMEOUT_S = 1.0
 KILL_STATUS_TIMEOUT_S = 0.6
 RETRY_S = 0.5

@@ -20,6 +20,7 @@ from hashlib import blake2s
 from typing import Any, NamedTuple
 
 from companion.core.counts import Refusal
+from companion.core.trajectory import REVISIONS
 
 REVISION_JUMP_MAX = 10_000
 """no motion is further ahead than this of those that are known: nobody may use up the revisions for all others"""
@@ -142,10 +143,13 @@ def _digest(payload: bytes) -> bytes:
 
 
 def revision_fault(revision: int, own: int, told: Iterable[int]) -> str | None:
-    """Why a motion's revision is out of all order: too far ahead of one's own newest and of every one `told` by a peer.
+    """Why a motion's revision is out of all order: none that can be told, or too far ahead of one's own newest and of
+    every one `told` by a peer.
 
     Whoever starts late holds revision 0 and hears from the others' states how far they are.
     """
+    if revision >= REVISIONS:
+        return "the revisions of motions are used up"
     newest = max([own, *told])
     if revision > newest + REVISION_JUMP_MAX:
         return f"its revision {revision} is more than {REVISION_JUMP_MAX} ahead of {newest}, the newest known"

@@ -21,6 +21,7 @@ from companion.core.frames import Ned
 from companion.core.trajectory import (
     BLEND_MIN_S,
     GOTO_MIN_S,
+    REVISIONS,
     FleetTrajectory,
     GotoLeg,
     Leg,
@@ -151,7 +152,7 @@ class _GotoLeg(_Model):
 
 class _Motion(_Model):
     version: Literal[3]
-    revision: Annotated[int, Field(ge=0, lt=1 << 32)]
+    revision: Annotated[int, Field(ge=0, lt=REVISIONS)]
     start_ns: Annotated[int, Field(ge=0, lt=1 << 63)]
     issuer: Annotated[int, Field(ge=0, le=255)]
     shape: Annotated[str, Field(max_length=32)]

@@ -187,6 +187,7 @@ class FlightView:
         head = f"{progress.elapsed_s:6.1f} s  {progress.doing}: {_phases(fleet)}{_nearest(fleet)}"
         ended = [f"companion {i} (status {s})" for i, s in sorted(progress.ended.items())]
         ended += [f"vehicle {i}: {how}" for i, how in sorted(progress.autopilots_ended.items())]
+        ended += [f"vehicle {i}: {_text(s['killed'])}" for i, s in sorted(fleet.items()) if s and s.get("killed")]
         lines = [head, *([f"ended: {', '.join(ended)}"] if ended else [])]
         if self._live is not None:
             width, height = self._console.size
