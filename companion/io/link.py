@@ -16,7 +16,7 @@ from typing import Protocol
 from companion.config import Vehicle, serial_endpoint, udp_endpoint
 from companion.errors import CompanionError
 from companion.io.clock import realtime_to_monotonic
-from companion.wire.mavlink import FrameSplitter
+from companion.wire.mavlink_frames import FrameSplitter
 
 SO_TIMESTAMPNS = 35
 """asm-generic/socket.h; Python's socket module does not name it"""

@@ -55,8 +55,9 @@ from companion.vehicle.autopilot.client import AutopilotClient
 from companion.vehicle.flight import Flight
 from companion.vehicle.orders import ORDER_FAULTS, Order, OrderBook, read_order, revision_fault
 from companion.vehicle.preflight import Check, PreflightReport, assignment_hash, own_checks, unmet
-from companion.wire.mavlink import MavlinkCodec, mode_name
+from companion.wire.mavlink import MavlinkCodec
 from companion.wire.peer import WIRE_FAULTS, decode_motion, decode_state, encode_motion, encode_state
+from companion.wire.px4 import mode_name
 
 TIMER_SLACK = 2.5
 """without a new position the control tick comes this many periods after the last"""

@@ -44,8 +44,8 @@ from companion.core.values import (
 )
 from companion.vehicle.autopilot.client import AutopilotClient
 from companion.vehicle.preflight import ACCURACY_LIMIT_M
-from companion.wire import mavlink as wire
-from companion.wire.mavlink import Px4Mode, mode_name
+from companion.wire import px4
+from companion.wire.px4 import Px4Mode, mode_name
 
 SETTLED_TOLERANCE_M = 0.6
 SETTLED_FOR_NS = 1_000_000_000
@@ -222,7 +222,7 @@ class Flight:
         self._orders.resume_ns = self._orders.release_ns = None
         self._happened(PhaseEvent.GIVEN_AWAY, now)
         self.autopilot.cancel()
-        self.autopilot.ask("kill", *wire.kill_parameters())
+        self.autopilot.ask("kill", *px4.kill_parameters())
         self._orders.kill_ns, self._orders.kill_armed = now.monotonic_ns, self.autopilot.armed
         self.notes.append("killed by command: the motors are stopped")
         return None
@@ -388,7 +388,7 @@ class Flight:
                 if ap.armed:
                     self.notes.append("kill given up: the autopilot has not disarmed")
             else:
-                ap.ask("kill", *wire.kill_parameters())
+                ap.ask("kill", *px4.kill_parameters())
         if orders.release_ns is not None:
             left = ap.custom_mode not in orders.modes_to_leave
             if now.monotonic_ns - orders.release_ns > (LATE_MODE_NS if left else RELEASE_LIMIT_NS):
@@ -427,7 +427,7 @@ class Flight:
             self._fail(Failsafe.NOT_ARMED, now, f"{what}; the take-off is given up")
             self._happened(PhaseEvent.GIVEN_UP, now)
         else:
-            ap.ask("arming", *wire.arm_parameters(True), once=True)
+            ap.ask("arming", *px4.arm_parameters(True), once=True)
 
     def _disarmed_early(self, now: Instant) -> None:
         """A take-off that its pilot has ended by disarming; take-off mode would take off whoever arms next."""
@@ -448,7 +448,7 @@ class Flight:
             altitude = self.config.origin.altitude_amsl_m + self.config.formation.altitude_m
             if self.config.fleet.frame == "local":
                 altitude = float("nan")
-            ap.ask("take-off", *wire.takeoff_parameters(altitude))
+            ap.ask("take-off", *px4.takeoff_parameters(altitude))
 
     def _watch_climb(self, now: Instant, positioned: bool) -> None:
         ap = self.autopilot

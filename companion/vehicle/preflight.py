@@ -16,7 +16,7 @@ from companion.config import FleetConfig, Vehicle
 from companion.core import assignment
 from companion.core.frames import Geodetic, Ned, geodetic_to_ned
 from companion.core.trajectory import FleetTrajectory
-from companion.wire import mavlink as wire
+from companion.wire import px4
 
 HEARTBEAT_LIMIT_S = 3.0
 POSITION_LIMIT_S = 0.5
@@ -100,7 +100,7 @@ def own_checks(
         rows += _health_checks(facts, config)
         if place is not None:
             rows += _start_checks(facts, config, place)
-        if facts.autopilot_kind == wire.AUTOPILOT_PX4:
+        if facts.autopilot_kind == px4.AUTOPILOT_PX4:
             rows += _parameter_checks(facts, config)
     return tuple(replace(row, vehicle=vehicle.id) for row in rows)
 
@@ -123,11 +123,11 @@ def _link_checks(facts: AutopilotFacts, vehicle: Vehicle) -> list[Check]:
             f"an autopilot of system id {foreign} is on the link beside the own one", permanent=True,
         ),
         Check(
-            "autopilot", kind, f"= {wire.AUTOPILOT_PX4} (PX4)", kind == wire.AUTOPILOT_PX4,
+            "autopilot", kind, f"= {px4.AUTOPILOT_PX4} (PX4)", kind == px4.AUTOPILOT_PX4,
             f"autopilot is no PX4 (MAV_AUTOPILOT {kind})", permanent=True,
         ),
         Check(
-            "vehicle type", type_, "a multicopter", type_ in wire.MULTICOPTERS,
+            "vehicle type", type_, "a multicopter", type_ in px4.MULTICOPTERS,
             f"vehicle is no multicopter (MAV_TYPE {type_})", permanent=True,
         ),
     ]  # fmt: skip

@@ -11,6 +11,7 @@ import re
 import select
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import time
@@ -22,14 +23,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pymavlink.dialects.v20 import development as mavlink
 
 from companion.config import FleetConfig, Vehicle, autopilot_port, companion_port
 from companion.core.frames import Geodetic, Ned, geodetic_to_ned, ned_to_geodetic
 from companion.errors import CompanionError, ConfigError
 from companion.io.link import SO_TIMESTAMPNS, received_unix_ns
 from companion.vehicle.preflight import same_setting
-from companion.wire.mavlink import dialect as mavlink
-from companion.wire.mavlink import interval_parameters, parameter_value
+from companion.wire.px4 import interval_parameters, parameter_value
 from sim.autopilot.stubs import TRUTH_DTYPE
 
 GCS_PORT = 14550
@@ -355,7 +356,7 @@ class SitlHost:
                 case mavlink.MAVLink_extended_sys_state_message():
                     instance.landed_state = message.landed_state
                 case mavlink.MAVLink_param_value_message():
-                    instance.checked[message.param_id.rstrip("\x00")] = parameter_value(message)
+                    instance.checked[message.param_id.rstrip("\x00")] = _value_of(message)
 
     def _read_truth(self, instance: _Instance) -> None:
         rows = []
@@ -430,3 +431,7 @@ def _other_name_set(instance: _Instance, name: str) -> bool:
 
 
 __all__ = ["FLEET_PARAMETERS", "Px4Instance", "SitlHost", "SitlSettings", "check_build"]
+
+
+def _value_of(message: Any) -> float | int:
+    return parameter_value(struct.pack("<f", message.param_value), message.param_type)

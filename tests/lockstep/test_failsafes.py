@@ -27,8 +27,8 @@ from companion.core.frames import Ned
 from companion.core.values import Instant, PeerMessage, Phase
 from companion.vehicle.autopilot.client import AutopilotClient
 from companion.vehicle.flight import ON_GROUND
-from companion.wire.mavlink import Px4Mode, mode_parameters
 from companion.wire.peer import encode_state
+from companion.wire.px4 import Px4Mode, mode_parameters
 from sim.autopilot.faults import Fault, FaultKind
 from sim.lockstep.lockstep import Lockstep
 

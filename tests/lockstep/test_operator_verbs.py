@@ -27,8 +27,8 @@ from companion.core.values import ZERO, Instant, Phase
 from companion.operator.client import Operator, velocity_leg
 from companion.vehicle.agent import Agent
 from companion.vehicle.orders import Place
-from companion.wire.mavlink import Px4Mode
 from companion.wire.peer import encode_motion
+from companion.wire.px4 import Px4Mode
 from sim.lockstep.lockstep import Lockstep
 
 pytestmark = pytest.mark.timeout(600)

@@ -16,8 +16,8 @@ from companion.config import FleetConfig
 from companion.core.frames import Ned
 from companion.core.trajectory import FleetTrajectory, TrajectoryHistory, VelocityLeg, with_legs
 from companion.core.values import Phase
-from companion.wire.mavlink import Px4Mode
 from companion.wire.peer import encode_motion
+from companion.wire.px4 import Px4Mode
 from sim.autopilot.faults import Fault, FaultKind
 from sim.launch.summary import Flight, summarise
 from sim.lockstep.lockstep import UTC_AT_START_NS, Lockstep

@@ -26,7 +26,9 @@ from companion.vehicle.preflight import (
     same_setting,
 )
 from companion.wire import mavlink as wire
-from companion.wire.mavlink import MavlinkCodec, Px4Mode
+from companion.wire import px4
+from companion.wire.mavlink import MavlinkCodec
+from companion.wire.px4 import Px4Mode
 
 RETRY_S = 0.5
 TRIES = 8
@@ -173,7 +175,7 @@ class AutopilotClient:
     """One autopilot as seen over its link."""
 
     def __init__(
-        self, link: MavlinkCodec, fleet_origin: Geodetic | None, position_rate_hz: float = wire.POSITION_RATE_HZ
+        self, link: MavlinkCodec, fleet_origin: Geodetic | None, position_rate_hz: float = px4.POSITION_RATE_HZ
     ) -> None:
         self.link = link
         self.position_rate_hz = position_rate_hz
@@ -286,11 +288,11 @@ class AutopilotClient:
 
     def _set_up(self) -> None:
         """Ask for what we read, and for no more: a companion's link may be a serial line."""
-        streams = {**wire.STREAMS_HZ, wire.POSITION_MESSAGE_ID: self.position_rate_hz}
+        streams = {**px4.STREAMS_HZ, px4.POSITION_MESSAGE_ID: self.position_rate_hz}
         for message_id, rate_hz in streams.items():
-            self.ask(f"stream {message_id}", *wire.interval_parameters(message_id, rate_hz))
-        for message_id in wire.STREAMS_OFF:
-            self.ask(f"stream {message_id}", *wire.interval_parameters(message_id, 0.0))
+            self.ask(f"stream {message_id}", *px4.interval_parameters(message_id, rate_hz))
+        for message_id in px4.STREAMS_OFF:
+            self.ask(f"stream {message_id}", *px4.interval_parameters(message_id, 0.0))
 
     def _unwrapped(self, boot_ms: int, now: Instant) -> int:
         """Time since boot whose 32 bit go round every 49.7 days, gone on with.
@@ -360,7 +362,7 @@ class AutopilotClient:
 
     def _answer(self, event: wire.CommandAnswer, now: Instant) -> None:
         queue = self._queues.get(event.command)
-        if event.command == wire.REQUEST_MESSAGE:
+        if event.command == px4.REQUEST_MESSAGE:
             return  # asked for again until the message itself comes
         if not queue or queue[0].tries == 0:
             self.counts["answer to nothing asked"] += 1
@@ -411,7 +413,7 @@ class AutopilotClient:
 
     def set_mode(self, mode: Px4Mode) -> None:
         """Ask for a flight mode; one asked for before is forgotten."""
-        command, *parameters = wire.mode_parameters(mode)
+        command, *parameters = px4.mode_parameters(mode)
         if self._mode_asked is not None and self._mode_asked is not mode:
             self._queues[command].clear()
             self._outcomes.pop(self._mode_asked.name, None)
@@ -446,7 +448,7 @@ class AutopilotClient:
             return out
         if self._asks_origin and now.monotonic_ns >= self._next_origin_ns:
             self._next_origin_ns = now.monotonic_ns + 1_000_000_000
-            out.append(self.link.command(*wire.request_message_parameters(wire.ORIGIN_MESSAGE_ID)))
+            out.append(self.link.command(*px4.request_message_parameters(px4.ORIGIN_MESSAGE_ID)))
         for queue in self._queues.values():
             while queue and queue[0].given_up and now.monotonic_ns >= queue[0].next_ns:
                 request = queue.popleft()
