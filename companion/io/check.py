@@ -14,15 +14,17 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from companion.config import FleetConfig, Vehicle
+from companion.config import FleetConfig
+from companion.config.derived import Vehicle
 from companion.errors import CompanionError
 from companion.io.clock import FleetClock
 from companion.io.link import Link, open_link
 from companion.io.loop import network_settings
 from companion.io.zenoh_peers import OperatorLink
 from companion.vehicle.autopilot.client import AutopilotClient
-from companion.vehicle.preflight import Check, own_checks, tidy
+from companion.vehicle.preflight import own_checks
 from companion.wire.mavlink import MavlinkCodec
+from companion.wire.operator import Check, tidy
 
 FREE_LEAST_GB = 1.0
 """a recording takes 25 MB for half an hour; nobody deletes the old ones"""

@@ -13,7 +13,8 @@ import termios
 import time
 from typing import Protocol
 
-from companion.config import Vehicle, serial_endpoint, udp_endpoint
+from companion.config.derived import Vehicle
+from companion.config.endpoints import serial_endpoint, udp_endpoint
 from companion.errors import CompanionError
 from companion.io.clock import realtime_to_monotonic
 from companion.wire.mavlink_frames import FrameSplitter

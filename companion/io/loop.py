@@ -6,7 +6,6 @@ follow from; what can wait (records, replies) is done after them.
 """
 
 import gc
-import json
 import os
 import secrets
 import select
@@ -17,7 +16,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,8 +32,8 @@ from companion.io.traffic import tcp_bytes_sent
 from companion.io.zenoh_peers import PeerMessage, PeerNetwork, PeerNetworkSettings, PresenceChange, Request
 from companion.vehicle.agent import Agent, Outputs
 from companion.vehicle.border import Border
-from companion.vehicle.preflight import ClockReading
 from companion.wire.events import encode_event
+from companion.wire.operator import CLOCK_QUESTION, ClockReading, encode
 
 TICK_RECORD = struct.Struct("<qqqff?6f")
 """body of the "tick" channel: lateness ns, sensor-to-setpoint latency ns (-1 for a timer's tick), CPU ns of the loop so
@@ -317,26 +316,30 @@ class Companion:
     def _make_status(self, now: Instant) -> bytes:
         status = self.agent.status(now)
         counters = self.network.counters
-        status["lateness_ms"] = self.lateness_ns * 1e-6
-        status["own_id_heard"] = self.agent.own_id_heard(now)
-        status["dropped"] = counters.dropped
-        status["recorder_lost"] = 0 if self.recorder is None else self.recorder.lost
         elsewhere = {
             "mavlink: another address than the autopilot's": self.link.foreign_datagrams,
             "mavlink: could not be sent": self.link.send_failures,
             "peer: malformed": counters.malformed,
         }
-        status["rejected"] |= {kind: count for kind, count in elsewhere.items() if count}
-        status["rejected"] |= {f"raised: {kind}": count for kind, count in self.border.raised.items()}
-        return json.dumps(status).encode()
+        rejected = {kind: count for kind, count in elsewhere.items() if count}
+        rejected |= {f"raised: {kind}": count for kind, count in self.border.raised.items()}
+        return encode(
+            replace(
+                status,
+                rejected=status.rejected | rejected,
+                lateness_ms=self.lateness_ns * 1e-6,
+                dropped=counters.dropped,
+                recorder_lost=0 if self.recorder is None else self.recorder.lost,
+            )
+        )
 
     def _preflight(self, request: Request, now: Instant) -> bytes:
-        if request.payload == b"clock":
+        if request.payload == CLOCK_QUESTION:
             received_ns = self.clock.at(request.received_monotonic_ns).fleet_ns
             answered_ns = self.clock.now().fleet_ns
             reading = ClockReading(boot_id=self.boot_id, received_ns=received_ns, answered_ns=answered_ns)
-            return reading.model_dump_json().encode()
-        return self.agent.account(now).model_dump_json().encode()
+            return encode(reading)
+        return encode(self.agent.account(now))
 
     def _each_second(self, now_ns: int) -> None:
         self._second_ns = now_ns + 1_000_000_000

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from companion.config import parse
+from companion.config.file import parse
 from companion.core.failsafe import Failsafe
 from companion.core.values import Instant
 from companion.errors import CompanionError

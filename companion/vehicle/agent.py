@@ -4,13 +4,11 @@ The same object flies a drone, a stub in real time, a stub in lockstep, and a re
 go in, bytes come out. It never reads a clock and never raises for what others send.
 """
 
-import json
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import dist
 from random import Random
-from typing import Any
 
 from companion.config import FleetConfig
 from companion.core.budget import Bucket, ExaminationBudget
@@ -33,7 +31,7 @@ from companion.core.trajectory import (
     over_the_pads,
     with_legs,
 )
-from companion.core.trajectory_check import Fault, examine
+from companion.core.trajectory_check import Fault, examine, revision_fault
 from companion.core.trigger import Situation
 from companion.core.values import (
     AIRBORNE_PHASES,
@@ -53,10 +51,19 @@ from companion.core.values import (
 from companion.errors import ConfigError, WireError
 from companion.vehicle.autopilot.client import AutopilotClient
 from companion.vehicle.flight import Flight
-from companion.vehicle.orders import ORDER_FAULTS, Order, OrderBook, read_order, revision_fault
-from companion.vehicle.preflight import Check, PreflightReport, assignment_hash, own_checks, unmet
+from companion.vehicle.orders import ORDER_FAULTS, OrderBook
+from companion.vehicle.preflight import own_checks
 from companion.wire.mavlink import MavlinkCodec
-from companion.wire.peer import WIRE_FAULTS, decode_motion, decode_state, encode_motion, encode_state
+from companion.wire.operator import Answer, Check, Command, PreflightReport, Status, decode_command, encode, unmet
+from companion.wire.peer import (
+    WIRE_FAULTS,
+    decode_motion,
+    decode_state,
+    encode_motion,
+    encode_state,
+    motion_from_json,
+    motion_to_json,
+)
 from companion.wire.px4 import mode_name
 
 TIMER_SLACK = 2.5
@@ -201,8 +208,6 @@ class Agent:
         self._own_id_ns: int | None = None
         """when somebody else last spoke under this vehicle's id (monotonic)"""
         self._jumps = 0
-        self._assignment: str | None = None
-        """hash of the first formation's assignment, once asked for"""
         self._outputs = Outputs()
 
     @property
@@ -303,22 +308,23 @@ class Agent:
         again = self.orders.answer_again(payload)
         if again is not None:
             return again
-        order = read_order(payload, self.id)
-        if isinstance(order, Refusal):
-            return self._refuse(order)
-        refusal = self.orders.refusal(order, self.flight.begun)
+        try:
+            command = decode_command(payload)
+        except WireError as fault:
+            return self._refuse(Refusal(fault.kind, fault.detail))
+        refusal = self.orders.refusal(command.verb, command.after.get(self.id, ()), self.flight.begun)
         if refusal is not None:
             return self._refuse(refusal, in_order=False)
-        reason = self._obey(order, now)
+        reason = self._obey(command, now)
         if reason is None:
-            self.orders.obeyed_now(order)
+            self.orders.obeyed_now(command)
         answer = self._reply(reason)
         self.orders.answered(payload, answer)
         return answer
 
-    def _obey(self, order: Order, now: Instant) -> str | None:
+    def _obey(self, command: Command, now: Instant) -> str | None:
         """Do what is commanded; returns why not."""
-        match order.verb:
+        match command.verb:
             case "takeoff":
                 return self._command_take_off(now)
             case "land":
@@ -328,13 +334,12 @@ class Agent:
             case "resume":
                 return self.flight.resume(now)
             case "kill":
-                confirmed = order.fields.get("confirm") is True
-                return self.flight.kill(now) if confirmed else "kill needs its confirmation"
+                return self.flight.kill(now) if command.confirm else "kill needs its confirmation"
         if not self._commands_budget.open(now.monotonic_ns):
             self.rejected["command: more than can be examined"] += 1
             return "too many motions at once: command it again"
         try:
-            motion = decode_motion(json.dumps(order.fields.get("motion")).encode())
+            motion = motion_from_json(command.motion)
         except WireError as error:
             self.rejected["command: motion"] += 1
             return str(error)
@@ -347,16 +352,17 @@ class Agent:
         return self._reply(refusal.sentence, in_order)
 
     def _reply(self, refusal: str | None, in_order: bool = True) -> bytes:
-        answer = {
-            "vehicle": self.id,
-            "accepted": refusal is None,
-            "reason": refusal,
-            "phase": self.phase.name.lower(),
-            "in_order": in_order,
-            "revision": self.history.newest.revision,
-            "place": [*self.orders.place(self.flight.begun)],
-        }
-        return json.dumps(answer).encode()
+        return encode(
+            Answer(
+                vehicle=self.id,
+                accepted=refusal is None,
+                reason=refusal,
+                phase=self.phase.name.lower(),
+                in_order=in_order,
+                revision=self.history.newest.revision,
+                place=self.orders.place(self.flight.begun),
+            )
+        )
 
     def _command_take_off(self, now: Instant) -> str | None:
         if self.phase in FLYING_PHASES or self.phase is Phase.PREFLIGHT:
@@ -415,15 +421,13 @@ class Agent:
     def account(self, now: Instant) -> PreflightReport:
         """The answer to a preflight question."""
         facts = self.autopilot.facts(now)
-        if self._assignment is None:
-            self._assignment = assignment_hash(self.config)
         origin = None if facts.origin is None else geodetic_to_ned(facts.origin, self.config.origin)
         return PreflightReport(
             vehicle=self.id,
             boot_id=self.boot_id,
             system_id=self.vehicle.system_id,
             configuration=self.config.shared_hash,
-            assignment=self._assignment,
+            assignment=self.config.assignment_hash,
             flying=self.phase in FLYING_PHASES,
             revision=self.history.newest.revision,
             position_ned_m=facts.position_ned_m,
@@ -803,39 +807,40 @@ class Agent:
 
     # -- telling the operator ----------------------------------------------------------------------------------------
 
-    def status(self, now: Instant) -> dict[str, Any]:
-        """What the operator's table shows; plain values."""
+    def status(self, now: Instant) -> Status:
+        """This vehicle's account of itself, but for what only its process knows."""
         tick = self._tick
         age = self.peers.oldest_age_s(now)
         unready = unmet(self.checks(now))
-        return {
-            "vehicle": self.id,
-            "phase": self.phase.name.lower(),
-            "mode": mode_name(self.autopilot.custom_mode),
-            "killed": None if self.flight.killed is None else self.flight.killed.value,
-            "armed": self.autopilot.armed,
-            "ready": [c.message for c in unready],
-            "unfit": [c.message for c in unready if c.permanent],
-            "revision": self.history.newest.revision,
-            "fleet": self.config.fleet.name,
-            "up_s": 0.0 if self._began_ns is None else (now.monotonic_ns - self._began_ns) * 1e-9,
-            "place": [*self.orders.place(self.flight.begun)],
-            "shape": self.history.newest.shape,
-            "moving": self.history.newest.end_ns is None or bool(self.history.newest.legs),
-            "position_error_m": tick.position_error_m if tick else None,
-            "neighbours": tick.neighbours if tick else 0,
-            "nearest_m": tick.nearest_m if tick and tick.nearest_m >= 0 else None,
-            "oldest_age_s": age,
-            "messages": self.messages_sent,
-            "messages_by_cause": dict(self.sent_because),
-            "setpoints": self.setpoints_sent,
-            "battery_percent": self.autopilot.battery(now),
-            "autopilot_age_s": self.autopilot.heartbeat_age_s(now),
-            "configuration": self.config.shared_hash,
-            "failsafes": self.flight.failsafes[-FAILSAFES_TOLD_MOST:],
-            "rejected": dict(
+        return Status(
+            vehicle=self.id,
+            phase=self.phase.name.lower(),
+            mode=mode_name(self.autopilot.custom_mode),
+            killed=None if self.flight.killed is None else self.flight.killed.value,
+            armed=self.autopilot.armed,
+            ready=[c.message for c in unready],
+            unfit=[c.message for c in unready if c.permanent],
+            revision=self.history.newest.revision,
+            fleet=self.config.fleet.name,
+            up_s=0.0 if self._began_ns is None else (now.monotonic_ns - self._began_ns) * 1e-9,
+            place=self.orders.place(self.flight.begun),
+            shape=self.history.newest.shape,
+            moving=self.history.newest.end_ns is None or bool(self.history.newest.legs),
+            position_error_m=tick.position_error_m if tick else None,
+            neighbours=tick.neighbours if tick else 0,
+            nearest_m=tick.nearest_m if tick and tick.nearest_m >= 0 else None,
+            oldest_age_s=age,
+            messages=self.messages_sent,
+            messages_by_cause=dict(self.sent_because),
+            setpoints=self.setpoints_sent,
+            battery_percent=self.autopilot.battery(now),
+            autopilot_age_s=self.autopilot.heartbeat_age_s(now),
+            configuration=self.config.shared_hash,
+            failsafes=self.flight.failsafes[-FAILSAFES_TOLD_MOST:],
+            rejected=dict(
                 self.rejected + self.flight.counts + self.peers.rejected + self.link.rejected + self.autopilot.counts
             ),
-            "limited": dict(self.safety.counts),
-            "motion": json.loads(encode_motion(self.history.newest)),
-        }
+            limited=dict(self.safety.counts),
+            own_id_heard=self.own_id_heard(now),
+            motion=motion_to_json(self.history.newest),
+        )

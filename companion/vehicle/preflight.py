@@ -1,22 +1,19 @@
 """Preflight: what must be true of one vehicle before it takes off. Pure; every check is a row with its value and limit.
 
-A vehicle makes these rows of itself and takes off only if all are met, whoever asks. `preflight_fleet` compares what
+A vehicle makes these rows of itself and takes off only if all are met, whoever asks. `operator.preflight` compares what
 the vehicles say of themselves.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from hashlib import blake2s
-from math import hypot, inf, isfinite
-from typing import Annotated, Any, NamedTuple
+from math import hypot, inf
+from typing import NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field
-
-from companion.config import FleetConfig, Vehicle
-from companion.core import assignment
+from companion.config import FleetConfig
+from companion.config.derived import Vehicle
 from companion.core.frames import Geodetic, Ned, geodetic_to_ned
-from companion.core.trajectory import FleetTrajectory
 from companion.wire import px4
+from companion.wire.operator import Check, tidy
 
 HEARTBEAT_LIMIT_S = 3.0
 POSITION_LIMIT_S = 0.5
@@ -32,31 +29,6 @@ RC_RECEIVER_FLAG = 1 << 16
 """SYS_STATUS: the RC receiver is healthy"""
 ROUNDING = 1e-6
 """relative: PX4's parameters are float32"""
-
-
-_Text = Annotated[str, Field(max_length=4000)]
-
-
-@dataclass(frozen=True, slots=True)
-class Check:
-    """One row: what was looked at, what it was, what it may be."""
-
-    name: _Text
-    value: float | Annotated[int, Field(ge=-(1 << 63), lt=1 << 63)] | _Text | None
-    """None: not known"""
-    limit: _Text
-    """what is allowed, with its unit"""
-    passed: bool
-    message: _Text
-    """the fault as a sentence; of no meaning when passed"""
-    permanent: bool = False
-    """whether it cannot come right by waiting"""
-    vehicle: int = 0
-    """whose; 0: the fleet's"""
-
-    def sentence(self) -> str:
-        """The fault with the name of whose it is."""
-        return f"vehicle {self.vehicle}: {self.message}" if self.vehicle else self.message
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -351,78 +323,3 @@ def _parameter_checks(facts: AutopilotFacts, config: FleetConfig) -> Iterator[Ch
 
 def _level(p: Ned) -> float:
     return hypot(p.north, p.east)
-
-
-def tidy(value: float | int | None) -> float | int | str | None:
-    """A number as rows and JSON carry it."""
-    if value is None or isinstance(value, int):
-        return value
-    return round(value, 4) if isfinite(value) else str(value)
-
-
-def unmet(checks: Iterable[Check]) -> list[Check]:
-    """The rows that are not met."""
-    return [c for c in checks if not c.passed]
-
-
-def first_formation(config: FleetConfig, motion: FleetTrajectory) -> FleetTrajectory:
-    """The change of formation that the vehicles begin with from a motion: pads to slots, as they assign them."""
-    return config.motion_into(config.formation.shape, motion, motion.start_ns, 0)
-
-
-def assignment_hash(config: FleetConfig) -> str:
-    """Digest of who takes which slot of the first formation, to a millimetre, and of the rule that says so."""
-    slots = first_formation(config, config.first_motion).slots
-    text = "".join(f"{i}:{','.join(f'{x + 0.0:.3f}' for x in slots[i].after)};" for i in sorted(slots))
-    text = f"{assignment.VERSION}|{text}"
-    return blake2s(text.replace("-0.000", "0.000").encode(), digest_size=8).hexdigest()
-
-
-# Bounds that every true answer keeps by far, and within which what is computed from it cannot overflow.
-_Coordinate = Annotated[float, Field(ge=-1e8, le=1e8, allow_inf_nan=False)]
-_Id = Annotated[int, Field(ge=0, le=255)]
-_Word = Annotated[str, Field(max_length=64)]
-_Unsigned32 = Annotated[int, Field(ge=0, lt=1 << 32)]
-_TimeNs = Annotated[int, Field(ge=0, lt=1 << 63)]
-_Place = tuple[_Coordinate, _Coordinate, _Coordinate]
-
-
-class PreflightReport(BaseModel):
-    """What a vehicle answers to a preflight question: its own rows, and the facts that only a comparison can judge."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore")
-
-    vehicle: _Id
-    boot_id: _Unsigned32
-    system_id: _Id
-    configuration: _Word
-    assignment: _Word
-    flying: bool
-    """whether it flies on its companion's command"""
-    revision: _Unsigned32
-    """of its newest motion"""
-    position_ned_m: _Place | None
-    """fleet frame"""
-    slot_ned_m: _Place
-    """where its motion wants it now, fleet frame"""
-    origin_ned_m: _Place | None
-    """its estimator's origin in the fleet frame; None in a local frame, and while unknown"""
-    home_altitude_amsl_m: _Coordinate | None
-    own_id_heard: bool = False
-    """whether somebody else speaks under its id"""
-    checks: tuple[Check, ...]
-
-
-class ClockReading(BaseModel):
-    """A vehicle's fleet time at a question's arrival and at its answer."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore")
-
-    boot_id: _Unsigned32
-    received_ns: _TimeNs
-    answered_ns: _TimeNs
-
-
-def as_json(check: Check) -> dict[str, Any]:
-    """A row as JSON carries it."""
-    return {name: getattr(check, name) for name in Check.__dataclass_fields__}

@@ -6,16 +6,17 @@ from companion.core.events import Event, FailsafeActed, KillCause, Killed, Motio
 from companion.core.failsafe import Failsafe
 from companion.core.values import Phase
 from companion.errors import WireError
-from companion.wire.peer import decode_motion, encode_motion
+from companion.wire.peer import motion_from_json, motion_to_json
 
 
 def encode_event(event: Event) -> bytes:
     """An event's JSON."""
+    said: dict[str, object]
     match event:
         case PhaseChanged():
             said = {"kind": "phase", "before": event.before.name.lower(), "after": event.after.name.lower()}
         case MotionAdopted():
-            said = {"kind": "motion", "motion": json.loads(encode_motion(event.motion))}
+            said = {"kind": "motion", "motion": motion_to_json(event.motion)}
         case FailsafeActed():
             said = {"kind": "failsafe", "failsafe": event.failsafe.name.lower(), "sentence": event.sentence}
         case Killed():
@@ -30,7 +31,7 @@ def decode_event(payload: bytes) -> Event:
             case {"kind": "phase", "before": str(before), "after": str(after)}:
                 return PhaseChanged(Phase[before.upper()], Phase[after.upper()])
             case {"kind": "motion", "motion": dict(motion)}:
-                return MotionAdopted(decode_motion(json.dumps(motion).encode()))
+                return MotionAdopted(motion_from_json(motion))
             case {"kind": "failsafe", "failsafe": str(name), "sentence": str(sentence)}:
                 return FailsafeActed(Failsafe[name.upper()], sentence)
             case {"kind": "killed", "cause": str(cause)}:

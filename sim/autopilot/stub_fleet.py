@@ -4,7 +4,9 @@ from math import cos, pi, radians, sin
 from pathlib import Path
 from random import Random
 
-from companion.config import FleetConfig, Vehicle, autopilot_port, companion_port, udp_endpoint
+from companion.config import FleetConfig
+from companion.config.derived import Vehicle
+from companion.config.endpoints import autopilot_port, companion_port, udp_endpoint
 from companion.core.frames import Ned
 from companion.errors import ConfigError
 from sim.autopilot.dynamics import DynamicsParameters, GustParameters, NoiseParameters

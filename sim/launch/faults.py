@@ -5,7 +5,8 @@ import socket
 from dataclasses import dataclass
 from pathlib import Path
 
-from companion.config import FleetConfig, read_tables
+from companion.config import FleetConfig
+from companion.config.file import read_tables
 from companion.errors import CompanionError, ConfigError
 from sim.autopilot.faults import Fault, decode_order, encode_order
 from sim.autopilot.stub_fleet import stub_port

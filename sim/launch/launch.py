@@ -17,11 +17,13 @@ from typing import IO, Any
 import numpy as np
 import tomli_w
 
-from companion.config import FleetConfig, parse
+from companion.config import FleetConfig
+from companion.config.file import parse
 from companion.errors import CompanionError, RefusedError
 from companion.io.loop import network_settings
 from companion.io.zenoh_peers import OperatorLink
 from companion.operator.client import Answers, Operator, PreflightError
+from companion.wire.operator import Status
 from sim.autopilot.stubs import TRUTH_DTYPE
 from sim.launch.faults import ScheduledFault, order_fault
 from sim.launch.reference_loop import read_reference_loop
@@ -71,7 +73,7 @@ class Progress:
 
     elapsed_s: float
     doing: str
-    vehicles: Mapping[int, Mapping[str, Any] | None]
+    vehicles: Mapping[int, Status | None]
     ended: Mapping[int, int]
     """vehicle -> exit status of its companion, where it has ended"""
     autopilots_ended: Mapping[int, str] = field(default_factory=dict)
@@ -227,13 +229,13 @@ def _fly(
         centroid_limit_m=0.5 if options.px4 is None else 1.0,
         lost=lost,
         autopilots_lost=autopilots_lost,
-        disarmed={i: not said["armed"] for i, said in final.items()},
+        disarmed={i: not said.armed for i, said in final.items()},
         versions={"python": sys.version.split()[0], **{name: version(name) for name in LIBRARIES}},
     )
     for i in ids:
         flight.read_file(i, folder / f"vehicle-{i}.mcap")
         said = final.get(i)
-        flight.rejected += Counter(said["rejected"] if said else {})
+        flight.rejected += Counter(said.rejected if said else {})
     rows = read_reference_loop(folder / "reference.bin")
     flight.reference_lateness_ns = rows[rows[:, 0] >= takeoff_ns, 1].astype(float)
     summary = {
@@ -295,14 +297,14 @@ class Watch:
     began: float
     ready: Path | None = None
     """a file that is there once the autopilots have their parameters; None: nobody sets any here"""
-    said: dict[int, dict[str, Any]] = field(default_factory=dict)
+    said: dict[int, Status] = field(default_factory=dict)
     """each vehicle's last account"""
     asked_ns: int = 0
     """when the take-off was last commanded (UTC)"""
     clock: Callable[[], float] = time.monotonic
     sleep: Callable[[float], None] = time.sleep
 
-    def _look(self, doing: str) -> dict[int, dict[str, Any] | None]:
+    def _look(self, doing: str) -> dict[int, Status | None]:
         answers = self.operator.status()
         self.said.update({i: s for i, s in answers.items() if s is not None})
         self.show(Progress(self.clock() - self.began, doing, answers, self.ended(), self.autopilots_ended()))
@@ -353,12 +355,12 @@ class Watch:
             for i, how in self.autopilots_ended().items():
                 raise CompanionError(f"vehicle {i}: {how} before take-off")
             answers = self._look("starting")
-            if self._parametrised and all(s is not None and not s["ready"] for s in answers.values()):
+            if self._parametrised and all(s is not None and not s.ready for s in answers.values()):
                 return
             if interrupted():
                 raise CompanionError("interrupted before take-off")
             # Once all speak, so that all are named; seen twice, since what comes in at the start has no order.
-            unfit = all(s is not None for s in answers.values()) and any(s["unfit"] for s in answers.values() if s)
+            unfit = all(s is not None for s in answers.values()) and any(s.unfit for s in answers.values() if s)
             if (unfit and unfit_before) or self.clock() > deadline:
                 return
             unfit_before = unfit
@@ -382,7 +384,7 @@ class Watch:
                 raise CompanionError(self.processes.why_ended("autopilots", "in flight"))
             tried = self.clock() - start > TAKE_OFF_GRACE_S
             down = ("landed", "released", "idle") if tried else ("landed", "released")
-            done = [(s["phase"] in down and not s["armed"]) or _unheard(s) for s in staying]
+            done = [(s.phase in down and not s.armed) or _unheard(s) for s in staying]
             if staying and all(done) and len(staying) + len(gone) == len(self.ids):
                 return lost
             while coming and self.clock() - start >= coming[0].at_s:
@@ -397,7 +399,6 @@ class Watch:
             self.sleep(POLL_S)
 
 
-def _unheard(status: Mapping[str, Any]) -> bool:
+def _unheard(status: Status) -> bool:
     """Whether a vehicle's autopilot has said nothing for so long that nobody need wait for it to land."""
-    age_s = status.get("autopilot_age_s")
-    return age_s is not None and age_s > UNHEARD_S
+    return status.autopilot_age_s is not None and status.autopilot_age_s > UNHEARD_S

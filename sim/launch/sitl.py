@@ -1,8 +1,8 @@
 """Real PX4 SITL instances (SIH quadrotor, headless) in the place of stubs: started, parametrised, watched, ended.
 
 PX4 takes instance numbers: instance i has system id i + 1 and speaks to UDP 14540 + i; past ten it would send all to
-14549, so those get one more MAVLink link by the port rule of `companion.config`. The simulator's truth comes as
-HIL_STATE_QUATERNION on 19410 + i, the state of arming and mode from the ground station's link on 14550.
+14549, so those get one more MAVLink link by the port rule of `companion.config.endpoints`. The simulator's truth comes
+as HIL_STATE_QUATERNION on 19410 + i, the state of arming and mode from the ground station's link on 14550.
 """
 
 import json
@@ -25,7 +25,9 @@ from typing import Any
 import numpy as np
 from pymavlink.dialects.v20 import development as mavlink
 
-from companion.config import FleetConfig, Vehicle, autopilot_port, companion_port
+from companion.config import FleetConfig
+from companion.config.derived import Vehicle
+from companion.config.endpoints import autopilot_port, companion_port
 from companion.core.frames import Geodetic, Ned, geodetic_to_ned, ned_to_geodetic
 from companion.errors import CompanionError, ConfigError
 from companion.io.link import SO_TIMESTAMPNS, received_unix_ns

@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from companion.config import FleetConfig, parse
+from companion.config import FleetConfig
+from companion.config.file import parse
 from companion.core.failsafe import Failsafe
 from companion.core.safety.filter import COLLISION_DISTANCE_M as COLLISION_M
 from companion.core.values import FLYING_PHASES, Instant, Phase

@@ -13,7 +13,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from companion.config import FleetConfig, parse
+from companion.config import FleetConfig
+from companion.config.file import parse
 from companion.core.frames import Ned
 from companion.core.safety.filter import COLLISION_DISTANCE_M as COLLISION_M
 from companion.core.values import Phase

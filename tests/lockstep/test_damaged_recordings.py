@@ -13,7 +13,8 @@ import pytest
 import tomli_w
 from flights import DEFAULT, READY_S, Tape, launch
 
-from companion.config import FleetConfig, parse, read_tables
+from companion.config import FleetConfig
+from companion.config.file import parse, read_tables
 from companion.core.values import Instant
 from companion.io.recorder import Recorder, RecordingError, read_recording
 from companion.io.replay import ReplayResult, replay_file

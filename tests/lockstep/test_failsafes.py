@@ -93,7 +93,7 @@ class Scene:
         return self.ls.vehicles[1].agent.phase
 
     def count(self, failsafe: Failsafe) -> int:
-        told = self.ls.vehicles[1].agent.status(self.ls.now)["rejected"]
+        told = self.ls.vehicles[1].agent.status(self.ls.now).rejected
         return int(told.get(failsafe.value, 0))
 
     def after(self, text: str) -> float:
@@ -331,7 +331,7 @@ def alone_for_long() -> tuple[float, float]:
     s = scene(change=brief)
     s.ls.partition({1}, {2})
     until(s.ls, 10.0, lambda: s.phase is Phase.DETACHED)
-    s.began_s = first(s.ls, "waiting -> apart", 1)
+    s.began_s = first(s.ls, "waiting -> detached", 1)
     must_end(s, Phase.LANDED)
     return s.noted(Failsafe.ALONE_FOR_LONG), 4.0
 
@@ -484,7 +484,7 @@ def battery_unknown() -> tuple[float, float]:
     s.ls.vehicles[1].autopilot.inject(Fault(FaultKind.LOW_BATTERY, 0.5))
     wait(s.ls, 6.0)
     assert s.count(Failsafe.BATTERY_UNKNOWN) == 1
-    assert s.ls.vehicles[1].agent.status(s.ls.now)["battery_percent"] == -1
+    assert s.ls.vehicles[1].agent.status(s.ls.now).battery_percent == -1
     must_go_on(s, Phase.WAITING)
     return s.after(Failsafe.BATTERY_UNKNOWN.value), 5.0
 
@@ -548,7 +548,7 @@ def not_finite() -> tuple[float, float]:
     boot_ms = agent.autopilot.boot.last_boot_ms + 1
     message = dialect.MAVLink_local_position_ned_message(boot_ms, float("nan"), 0.0, 0.0, 0.0, 0.0, 0.0)
     agent.receive_mavlink(bytes(message.pack(WORLD)), s.ls.now)
-    assert agent.status(s.ls.now)["rejected"]["not finite"] == 1
+    assert agent.status(s.ls.now).rejected["not finite"] == 1
     must_go_on(s, Phase.WAITING)
     return 0.0, 0.0
 
@@ -622,6 +622,6 @@ def test_a_position_that_jumps_on_the_ground_is_no_failsafe_in_the_air(when: str
         ls.command(b'{"verb":"takeoff"}')
     until_formed(ls)
     assert failsafes(ls) == []
-    assert not any("-> apart" in note for _, _, note in ls.notes)
+    assert not any("-> detached" in note for _, _, note in ls.notes)
     formation, _ = errors(ls, truth(ls, ls.now_ns * 1e-9 - 0.5), [1, 2])
     assert formation.max() < 0.5, "its new origin is known"

@@ -205,7 +205,7 @@ def test_the_others_hold_their_formation_without_the_one_that_was_taken(taken: T
 def test_a_vehicle_that_hears_nobody_lands_though_they_are_still_said_to_be_there(taken: TakenOver) -> None:
     limits = taken.ls.config.peer_limits
     for i in (1, 3):
-        alone_s = first(taken.ls, "nobody's states heard: hold", i) - taken.cut_s
+        alone_s = first(taken.ls, "nobody's states heard: leave formation", i) - taken.cut_s
         assert limits.isolated_flight_s < alone_s < limits.stale_after_s + limits.isolated_flight_s + 0.5
     assert distances(truth(taken.ls, taken.cut_s)).min() >= CLEARANCE_M
 
@@ -341,9 +341,9 @@ def test_hold_brings_the_formation_to_rest(operated: Operated) -> None:
 def test_status_tells_of_every_vehicle_where_it_is_in_the_flight(operated: Operated) -> None:
     for i, told in operated.status.items():
         assert told is not None
-        assert (told["vehicle"], told["phase"], told["mode"], told["shape"]) == (i, "holding", "OFFBOARD", "line")
-        assert told["neighbours"] == 3
-        assert told["ready"] == []
+        assert (told.vehicle, told.phase, told.mode, told.shape) == (i, "holding", "OFFBOARD", "line")
+        assert told.neighbours == 3
+        assert told.ready == []
 
 
 def test_a_motion_faster_than_the_limits_is_refused_by_every_vehicle(operated: Operated) -> None:

@@ -9,7 +9,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 
-from companion.config import FleetConfig, autopilot_port, companion_port, udp_endpoint
+from companion.config import FleetConfig
+from companion.config.endpoints import autopilot_port, companion_port, udp_endpoint
 
 HOST = "127.0.0.1"
 

@@ -88,7 +88,7 @@ def flown(folder: Path, build: Path, delay_s: float) -> Margin:
         begin_ns = time.time_ns()
         time.sleep(WINDOW_S)
         said = {i: s for i, s in flight.operator.status().items() if s is not None}
-        assert {i: s["phase"] for i, s in said.items()} == dict.fromkeys(fleet.ids, "moving")
+        assert {i: s.phase for i, s in said.items()} == dict.fromkeys(fleet.ids, "moving")
         flight.up.signal(signal.SIGINT)
         flight.up.wait(120.0)
         return measured(flight, begin_ns, link.held_s)

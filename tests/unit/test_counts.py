@@ -24,6 +24,7 @@ from companion.core.values import Instant
 from companion.vehicle.agent import REJECTED, Agent
 from companion.vehicle.autopilot.client import COUNTED
 from companion.wire import mavlink
+from companion.wire.operator import encode
 from companion.wire.peer import encode_motion
 
 ROOT = Path(companion.__file__).resolve().parent
@@ -122,7 +123,7 @@ def test_two_thousand_refused_plans_of_as_many_revisions_leave_the_status_as_sma
     sizes = []
     for n in range(2000):
         agent.receive_peer("fleet/2/plan", encode_motion(replace(sound, revision=20_000 + n)), NOW)
-        sizes.append(len(json.dumps(agent.status(NOW)))) if n in (0, 1999) else None
+        sizes.append(len(encode(agent.status(NOW)))) if n in (0, 1999) else None
     assert set(agent.rejected) == {f"plan: {RefusalKind.REVISION}", "plan: more than can be examined"}
     assert sum(agent.rejected.values()) == 2000
     assert sizes[1] - sizes[0] <= 60

@@ -7,16 +7,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import statuses
 
 from companion.errors import CompanionError
+from companion.wire.operator import Status
 from sim.launch.launch import LANDING_TIMEOUT_S, POLL_S, UNHEARD_S, Progress, Watch
 from sim.launch.sitl import ENDED_FILE, read_ended, tell_ended
 
-Said = dict[int, dict[str, Any] | None]
+Said = dict[int, Status | None]
 
 
-def status(phase: str, armed: bool = True, age_s: float = 0.5) -> dict[str, Any]:
-    return {"phase": phase, "armed": armed, "autopilot_age_s": age_s, "ready": [], "unfit": []}
+def status(phase: str, armed: bool = True, age_s: float = 0.5) -> Status:
+    return statuses.status(phase=phase, armed=armed, autopilot_age_s=age_s)
 
 
 @dataclass
@@ -49,7 +51,7 @@ class Fleet:
         return Watch(fleet, fleet, [1, 2, 3], self.shown.append, 0.0, clock=lambda: self.now_s, sleep=self.sleep)
 
 
-def landing(third: Callable[[float], dict[str, Any] | None]) -> Callable[[float], Said]:
+def landing(third: Callable[[float], Status | None]) -> Callable[[float], Said]:
     """Two vehicles that have landed by 20 s, and a third."""
 
     def said(now_s: float) -> Said:

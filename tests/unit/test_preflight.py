@@ -12,13 +12,10 @@ from companion.core.frames import Ned, ned_to_geodetic
 from companion.vehicle.preflight import (
     PARAMETERS,
     AutopilotFacts,
-    Check,
-    PreflightReport,
-    assignment_hash,
     own_checks,
     parameter_rules,
-    unmet,
 )
+from companion.wire.operator import Check, PreflightReport, decode, encode, unmet
 
 FILE = Path(__file__).resolve().parents[2] / "fleet.toml"
 PAD = Ned(2.0, -8.0, 0.0)
@@ -236,17 +233,23 @@ def test_an_account_survives_its_journey() -> None:
     rows = own_checks(replace(FIT, position_age_s=float("inf"), round_trip_s=None), CONFIG, CONFIG.vehicles[0], PAD)
     account = PreflightReport(
         vehicle=1, boot_id=7, system_id=1, configuration="c", assignment="a", flying=False, revision=0,
-        position_ned_m=PAD, slot_ned_m=PAD, origin_ned_m=None, home_altitude_amsl_m=None, checks=rows,
+        position_ned_m=PAD, slot_ned_m=PAD, origin_ned_m=None, home_altitude_amsl_m=None, own_id_heard=False,
+        checks=rows,
     )  # fmt: skip
-    again = PreflightReport.model_validate_json(account.model_dump_json())
+    again = decode(PreflightReport, encode(account))
     assert again == account
     assert isinstance(again.checks[0], Check)
 
 
 def test_the_assignments_hash_follows_slots_and_vehicles() -> None:
-    assert assignment_hash(CONFIG) == assignment_hash(config(battery_min_percent=50.0))
-    wider = CONFIG.model_copy(update={"formation": CONFIG.formation.model_copy(update={"spacing_m": 5.0})})
-    assert assignment_hash(wider) != assignment_hash(CONFIG)
+    assert CONFIG.assignment_hash == config(battery_min_percent=50.0).assignment_hash
+
+    def widen(tables: dict[str, Any]) -> None:
+        tables["vehicle"] = tables["vehicle"][:3]
+        tables["formation"]["spacing_m"] = 5.0
+
+    wider = load(FILE, widen)
+    assert wider.assignment_hash != CONFIG.assignment_hash
 
 
 def test_the_name_under_which_this_px4_has_a_setting_is_enough_and_one_is_needed() -> None:

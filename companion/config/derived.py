@@ -1,0 +1,383 @@
+"""What follows from fleet.toml, the same in every vehicle."""
+
+import json
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+from hashlib import blake2s
+from math import ceil, inf, radians, sqrt
+from typing import Literal
+
+from companion.config.endpoints import companion_port
+from companion.config.numbers import Table
+from companion.config.schema import FleetTables, GotoLegTable, HoldLegTable, LegTable, TurnLegTable, VelocityLegTable
+from companion.core import assignment
+from companion.core.formation import SHAPES, Slots, centred, minimum_distance, rotated, shape_slots
+from companion.core.frames import Geodetic, Ned
+from companion.core.law.starling import Gains, paper_gains
+from companion.core.monitor import PeerMotion
+from companion.core.neighbours import PeerLimits
+from companion.core.safety.fence import Fence
+from companion.core.safety.filter import DOWNWASH_RATIO, SafetyLimits, safety_radius_m
+from companion.core.trajectory import (
+    PADS,
+    FleetTrajectory,
+    Leg,
+    SlotChange,
+    TurnLeg,
+    VelocityLeg,
+    goto_leg,
+    leg_end,
+    top_speed_m_s,
+    with_formation,
+    with_return,
+)
+from companion.core.trajectory_check import ALTITUDE_MIN_M, PLAN_SPEED_SHARE, MotionLimits
+from companion.core.trigger import ErrorTrigger, PeriodicTrigger, Spacing, SwitchingTrigger, Trigger
+from companion.core.values import ZERO
+from companion.errors import ConfigError
+
+LANDED_APART_M = 1.0
+"""vehicles that land where they are come down so far apart: a collision's distance, and the wander of both"""
+SPACING_MARGIN_M = 0.2
+"""slots stay this much farther apart than separation and barrier begin to act"""
+STALE_AFTER = 2.1
+"""a peer is stale after this many T_max without a word: one message may be lost"""
+EXCHANGE_DELAY_S = 0.05
+"""delay to a peer, as the error bound takes it beside t_min and the control period"""
+
+
+class Vehicle(Table):
+    """One vehicle with every default resolved."""
+
+    id: int
+    instance: int
+    """position in the file, from 0: ports and pads follow it"""
+    system_id: int
+    mavlink: str
+    zenoh: str | None
+    slot: int | Literal["auto"]
+    pad_north_m: float
+    pad_east_m: float
+
+
+class FleetConfig(FleetTables):
+    """fleet.toml and what follows from it: pads, slots, the first motion, gains and safety radius.
+
+    All of it comes from the file alone, since the vehicles must agree on it exactly.
+    """
+
+    @cached_property
+    def vehicles(self) -> tuple[Vehicle, ...]:
+        """The enabled vehicles, in the file's order."""
+        pads = self._grid_pads()
+        return tuple(
+            Vehicle(
+                id=v.id,
+                instance=k,
+                system_id=v.id if v.system_id is None else v.system_id,
+                mavlink=v.mavlink or f"udp://127.0.0.1:{companion_port(k)}",
+                zenoh=v.zenoh,
+                slot=v.slot,
+                pad_north_m=pads[k].north if v.pad_m is None else v.pad_m[0],
+                pad_east_m=pads[k].east if v.pad_m is None else v.pad_m[1],
+            )
+            for k, v in enumerate(self.vehicle)
+            if v.enabled
+        )
+
+    def _grid_pads(self) -> Slots:
+        """Two wide rows behind each other, as one lays vehicles out on a field."""
+        n = len(self.vehicle)
+        across = max(ceil(sqrt(2.5 * n)), 1)
+        s = self.launch.spacing_m
+        cells = [(-s * (k // across), s * (k % across), 0.0) for k in range(n)]
+        return rotated(centred(cells), radians(self.launch.heading_deg))
+
+    def by_id(self, vehicle_id: int) -> Vehicle:
+        """The enabled vehicle of that id; refused if there is none."""
+        for vehicle in self.vehicles:
+            if vehicle.id == vehicle_id:
+                return vehicle
+        known = ", ".join(str(v.id) for v in self.vehicles)
+        raise ConfigError(f"vehicle {vehicle_id} is not an enabled vehicle of this fleet; there are {known}")
+
+    @property
+    def origin(self) -> Geodetic:
+        """Origin of the fleet frame; of no meaning in the local frame."""
+        o = self.fleet.origin
+        return Geodetic(0.0, 0.0, 0.0) if o is None else Geodetic(o.latitude_deg, o.longitude_deg, o.altitude_amsl_m)
+
+    @property
+    def r0_m(self) -> float:
+        """Range of separation."""
+        return self.formation.spacing_m / 2 if self.law.r0_m is None else self.law.r0_m
+
+    @property
+    def gains(self) -> Gains:
+        """The law's gains: ours, or Eq. (2) of the paper as it stands within the acceleration limit."""
+        law = self.law
+        if law.kind == "paper":
+            return paper_gains(law.k_s, law.k_a, law.k_c, self.r0_m)._replace(a_max=law.a_max_m_s2)
+        return Gains(law.k_s, law.k_a, law.k_c, law.k_v, law.k_p, self.r0_m, law.a_max_m_s2, 1.0, 1.0, 1.0)
+
+    @cached_property
+    def trigger_rule(self) -> Trigger:
+        """The trigger of the configured kind."""
+        t = self.trigger
+        match t.kind:
+            case "error":
+                return ErrorTrigger(t.epsilon_m, t.gamma_s2, t.kappa)
+            case "switching":
+                return SwitchingTrigger(t.gamma_s2, t.alpha, t.beta, t.delta_min, t.delta_f, t.eta)
+            case "periodic":
+                return PeriodicTrigger(t.period_s)
+
+    @property
+    def near_rate(self) -> PeriodicTrigger:
+        """When vehicles speak that are near each other."""
+        return PeriodicTrigger(self.trigger.near_period_s)
+
+    @property
+    def message_spacing(self) -> Spacing:
+        return Spacing(self.trigger.t_min_s, self.trigger.t_max_s)
+
+    @property
+    def prediction_error_m(self) -> float:
+        """Bound on how far a peer that is heard may be from its prediction (m)."""
+        return self.trigger_rule.error_bound_m(self.peer_motion)
+
+    @property
+    def peer_motion(self) -> PeerMotion:
+        """What the vehicles must reckon with in each other.
+
+        The hold brakes the velocity of a vehicle that may fly at the speed limit relative to its plan; the filter may
+        push it on meanwhile. The paper's hold lets it stand.
+        """
+        x = self.limits
+        braking = x.speed_max_m_s / self.law.hold_damping_s if self.law.hold == "damped" else 0.0
+        return PeerMotion(
+            sigma_p_m=x.position_noise_m,
+            sigma_v_m_s=x.velocity_noise_m_s,
+            sigma_gust_m_s2=x.gust_m_s2,
+            a_max_m_s2=self.law.a_max_m_s2,
+            deviation_m_s2=max(x.avoidance_acceleration_m_s2, self.law.a_max_m_s2) + braking,
+            drift_m_s=x.speed_max_m_s if self.law.hold == "zero" else 0.0,
+            speed_m_s=2.0 * x.speed_max_m_s,
+            latency_s=EXCHANGE_DELAY_S + self.trigger.t_min_s + 1.0 / x.control_rate_hz,
+            t_max_s=self.trigger.t_max_s,
+        )
+
+    @property
+    def radius_reason(self) -> str:
+        """Where the safety radius comes from, for messages."""
+        return f"{self.prediction_error_m:.2f} m of it since a peer is known no better with {self.trigger_rule.cause}"
+
+    @property
+    def safety_radius_m(self) -> float:
+        """Distance that the barrier keeps from a peer that is heard (m)."""
+        return safety_radius_m(self.prediction_error_m)
+
+    @property
+    def spacing_min_m(self) -> float:
+        """Smallest distance of two slots that leaves separation and barrier alone (m)."""
+        barrier = self.safety_radius_m if self.limits.barrier else 0.0
+        return max(self.r0_m, barrier) + SPACING_MARGIN_M
+
+    @property
+    def range_min_m(self) -> float:
+        """Smallest range at which peers are looked at (m): a neighbour's distance, and what two at the speed limit that
+        fly at each other need to stop, after what the exchange takes."""
+        x = self.limits
+        speed = x.speed_max_m_s
+        braking_m = speed * self.peer_motion.latency_s + speed**2 / (2.0 * x.avoidance_acceleration_m_s2)
+        return self.formation.spacing_m + 2.0 * braking_m
+
+    @property
+    def return_speed_m_s(self) -> float:
+        """How fast the centre flies back over the pads, and the slots about it (m/s): both together within the plan's
+        share of the limit."""
+        return PLAN_SPEED_SHARE * self.limits.speed_max_m_s / 2
+
+    @property
+    def motion_limits(self) -> MotionLimits:
+        """What every motion must keep, whoever proposes it."""
+        x = self.limits
+        # Slots that change places by the assignment stay 1/sqrt(2) of their distance apart (`assignment.assign`): with
+        # the offsets u before and w after of a pair u.w >= 0, since exchanging the two would else cost less.
+        apart_m = self.safety_radius_m / sqrt(2.0) if x.barrier else 0.0
+        return MotionLimits(x.speed_max_m_s, x.climb_max_m_s, x.descent_max_m_s, apart_m, self.geofence)
+
+    def motion_into(self, shape: str, motion: FleetTrajectory, at_ns: int, issuer: int) -> FleetTrajectory:
+        """The motion that takes over from `motion` with another formation.
+
+        The slots use what speed the centre leaves them, half of the limit at most.
+        """
+        x = self.limits
+        left = x.speed_max_m_s - top_speed_m_s(motion)
+        return with_formation(
+            motion, at_ns=at_ns, issuer=issuer, shape=shape, slots=self.slots(shape), pinned=self.pinned,
+            speed_m_s=max(min(left, x.speed_max_m_s / 2), (1.0 - PLAN_SPEED_SHARE) * x.speed_max_m_s),
+            climb_m_s=x.climb_max_m_s / 4, descent_m_s=x.descent_max_m_s / 4,
+        )  # fmt: skip
+
+    def motion_home(self, motion: FleetTrajectory, at_ns: int, issuer: int) -> FleetTrajectory:
+        """The motion that takes over from `motion` and brings every vehicle back over its own pad, to land."""
+        share = PLAN_SPEED_SHARE / 2
+        return with_return(
+            motion, self.first_motion, at_ns=at_ns, issuer=issuer, speed_m_s=self.return_speed_m_s,
+            climb_m_s=share * self.limits.climb_max_m_s, descent_m_s=share * self.limits.descent_max_m_s,
+        )  # fmt: skip
+
+    @property
+    def peer_limits(self) -> PeerLimits:
+        return PeerLimits(
+            hold=self.law.hold,
+            hold_damping_s=self.law.hold_damping_s,
+            range_m=self.peers.range_m,
+            stale_after_s=STALE_AFTER * self.trigger.t_max_s,
+            heartbeat_s=self.trigger.t_max_s,
+            isolated_flight_s=self.peers.isolated_flight_s,
+            uncertainty_m=self.prediction_error_m,
+            motion=self.peer_motion,
+            digest_size=self.peers.digest,
+        )
+
+    @property
+    def safety_limits(self) -> SafetyLimits:
+        x = self.limits
+        return SafetyLimits(
+            x.speed_max_m_s, x.climb_max_m_s, x.descent_max_m_s, x.jerk_max_m_s3,
+            x.avoidance_acceleration_m_s2, x.barrier, self.geofence,
+        )  # fmt: skip
+
+    @cached_property
+    def geofence(self) -> Fence | None:
+        """The fence as the companion flies it; None if there is none."""
+        x = self.fence
+        if x is None:
+            return None
+        north, east = (0.0, 0.0) if x.centre_m is None else x.centre_m
+        return Fence(
+            x.floor_m, x.ceiling_m, x.radius_m, north, east, x.polygon_m or (), x.margin_m, x.vertical_margin_m
+        )
+
+    def slots(self, shape: str) -> Slots:
+        """Slots (forward, right, down) of a shape for the enabled vehicles; refused if they are too close."""
+        count = len(self.vehicles)
+        if shape == "custom":
+            if len(self.formation.custom_m) != count:
+                raise ConfigError(
+                    f"$.formation.custom_m must have one slot for each of the {count} enabled vehicles, "
+                    f"got {len(self.formation.custom_m)}"
+                )
+            slots = centred(self.formation.custom_m)
+        elif shape in SHAPES:
+            slots = shape_slots(shape, count, self.formation.spacing_m)
+        else:
+            raise ConfigError(f"$.formation.shape must be one of {', '.join((*SHAPES, 'custom'))}, got {shape!r}")
+        self._check_slots(shape, slots)
+        lowest = self.formation.altitude_m - max(s.down for s in slots)
+        if lowest < ALTITUDE_MIN_M:
+            raise ConfigError(
+                f"$.formation.altitude_m: {shape!r} must have no slot below {ALTITUDE_MIN_M:g} m, got {lowest:.2f}"
+            )
+        return slots
+
+    def _check_slots(self, shape: str, slots: Slots) -> None:
+        nearest = minimum_distance(slots)
+        if nearest < self.spacing_min_m:
+            raise ConfigError(
+                f"$.formation.spacing_m: {shape!r} needs at least {self.spacing_min_m:.2f} m "
+                f"(the larger of separation's range {self.r0_m:.2f} m and the safety radius "
+                f"{self.safety_radius_m:.2f} m, {self.radius_reason}, and {SPACING_MARGIN_M} m), got {nearest:.2f} m"
+            )
+        if minimum_distance(slots, DOWNWASH_RATIO) < self.safety_radius_m + SPACING_MARGIN_M and self.limits.barrier:
+            raise ConfigError(
+                f"$.formation.spacing_m: slots of {shape!r} lie above each other inside the downwash ellipsoid "
+                f"(vertical half-axis {DOWNWASH_RATIO * self.safety_radius_m:.2f} m, horizontal "
+                f"{self.safety_radius_m:.2f} m): choose a larger spacing or a level shape"
+            )
+        level = minimum_distance([Ned(s.north, s.east, 0.0) for s in slots])
+        if level < LANDED_APART_M * (1.0 - 1e-9):
+            raise ConfigError(
+                f"$.formation.spacing_m: slots of {shape!r} must be at least {LANDED_APART_M:g} m apart on the level, "
+                f"since vehicles land where they are, got {level:.2f} m: choose a larger spacing or a level shape"
+            )
+
+    @cached_property
+    def pinned(self) -> dict[int, int]:
+        """Vehicle id -> slot, for the vehicles whose slot the file fixes."""
+        return {v.id: v.slot for v in self.vehicles if v.slot != "auto"}
+
+    @cached_property
+    def first_motion(self) -> FleetTrajectory:
+        """Where everybody starts: each over its own pad at the formation's altitude, at rest."""
+        heading = radians(self.formation.heading_deg)
+        pads = [Ned(v.pad_north_m, v.pad_east_m, 0.0) for v in self.vehicles]
+        centre = [sum(p[k] for p in pads) / len(pads) for k in range(2)]
+        level = rotated(centred(pads), -heading)
+        return FleetTrajectory(
+            revision=0,
+            start_ns=0,
+            issuer=0,
+            shape=PADS,
+            slots={v.id: SlotChange(s, s) for v, s in zip(self.vehicles, level, strict=True)},
+            blend_start_ns=0,
+            blend_s=0.0,
+            legs_start_ns=0,
+            centre_ned_m=Ned(centre[0], centre[1], -self.formation.altitude_m),
+            velocity_ned_m_s=ZERO,
+            heading_rad=heading,
+            heading_rate_rad_s=0.0,
+            heading_follows_turns=self.plan.heading == "track",
+            legs=(),
+        )
+
+    def plan_legs(self, start: Ned, velocity: Ned = ZERO) -> tuple[Leg, ...]:
+        """The plan's legs, begun at `start` with `velocity` (the centre's, m and m/s)."""
+        return tuple(self._legs(self.plan.legs, start, velocity))
+
+    def waypoint(self, start: Ned, velocity: Ned, table: GotoLegTable) -> Leg:
+        """The leg to a waypoint from a place and a velocity of the centre, within the vertical limits."""
+        x = self.limits
+        down = start.down if table.altitude_m is None else -table.altitude_m
+        return goto_leg(
+            start, velocity, Ned(table.north_m, table.east_m, down), table.speed_m_s,
+            PLAN_SPEED_SHARE * x.climb_max_m_s, PLAN_SPEED_SHARE * x.descent_max_m_s,
+        )  # fmt: skip
+
+    def _legs(self, tables: Sequence[LegTable], place: Ned, velocity: Ned) -> Iterator[Leg]:
+        """Legs of the core from their tables; how long a waypoint takes follows from where the leg before has led."""
+        for table in tables:
+            leg: Leg
+            match table:
+                case HoldLegTable():
+                    leg = VelocityLeg(ZERO, table.duration_s)
+                case VelocityLegTable():
+                    leg = VelocityLeg(Ned(table.north_m_s, table.east_m_s, -table.up_m_s), table.duration_s)
+                case TurnLegTable():
+                    angle = inf if table.angle_deg is None else radians(table.angle_deg)
+                    leg = TurnLeg(radians(table.rate_deg_s), angle)
+                case GotoLegTable():
+                    leg = self.waypoint(place, velocity, table)
+            yield leg
+            _, place, velocity, _ = leg_end(leg, place, velocity)
+
+    @cached_property
+    def first_formation(self) -> FleetTrajectory:
+        """The change of formation that the vehicles begin with: from their pads to the slots as all assign them."""
+        return self.motion_into(self.formation.shape, self.first_motion, self.first_motion.start_ns, 0)
+
+    @cached_property
+    def assignment_hash(self) -> str:
+        """Digest of who takes which slot of the first formation, to a millimetre, and of the rule that says so."""
+        slots = self.first_formation.slots
+        text = "".join(f"{i}:{','.join(f'{x + 0.0:.3f}' for x in slots[i].after)};" for i in sorted(slots))
+        text = f"{assignment.VERSION}|{text}"
+        return blake2s(text.replace("-0.000", "0.000").encode(), digest_size=8).hexdigest()
+
+    @cached_property
+    def shared_hash(self) -> str:
+        """Digest of what the vehicles must agree on: everything but links and the stubs' noise."""
+        shared = self.model_dump(exclude={"stub": True, "vehicle": {"__all__": {"mavlink", "zenoh"}}})
+        return blake2s(json.dumps(shared, sort_keys=True).encode(), digest_size=8).hexdigest()

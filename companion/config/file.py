@@ -1,0 +1,48 @@
+"""Reads a fleet.toml and validates it."""
+
+import json
+import tomllib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from companion.config.checks import faults
+from companion.config.derived import FleetConfig
+from companion.config.messages import sentence
+from companion.errors import ConfigError
+
+
+def load(path: Path, change: Callable[[dict[str, Any]], None] | None = None) -> FleetConfig:
+    """Read and validate a fleet.toml; `change` may edit the raw tables first (command-line overrides).
+
+    Raises ConfigError naming file, place, what came and what is allowed; all faults of the file at once.
+    """
+    return parse(read_tables(path, change), path.name)
+
+
+def read_tables(path: Path, change: Callable[[dict[str, Any]], None] | None = None) -> dict[str, Any]:
+    """The raw tables of a TOML file, edited by `change`."""
+    try:
+        tables = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: is not valid TOML: {error}") from error
+    if change is not None:
+        change(tables)
+    return tables
+
+
+def parse(tables: Mapping[str, Any], name: str) -> FleetConfig:
+    """Validate raw tables; `name` is the file's, for messages."""
+    try:
+        config = FleetConfig.model_validate_json(json.dumps(tables, default=str))
+    except ValidationError as error:
+        found = list(dict.fromkeys(sentence(e) for e in error.errors()))
+        raise ConfigError("\n".join(f"{name}: {fault}" for fault in found)) from error
+    found = faults(config)
+    if found:
+        raise ConfigError("\n".join(f"{name}: {fault}" for fault in found))
+    return config
