@@ -14,7 +14,7 @@ from companion.config import FleetConfig
 from companion.core.budget import Bucket, ExaminationBudget
 from companion.core.counts import Counts, Refusal, RefusalKind
 from companion.core.estimate import BiasObserver, SendFilter
-from companion.core.events import Event, MotionAdopted
+from companion.core.events import Event, FailsafeNoted, MotionAdopted, sentence
 from companion.core.failsafe import LATE_S, Failsafe
 from companion.core.frames import Ned, geodetic_to_ned
 from companion.core.law.starling import Law, StarlingLaw
@@ -45,15 +45,13 @@ from companion.core.values import (
     PeerMessage,
     PeerSample,
     Phase,
-    SafeSetpoint,
     VehicleState,
 )
 from companion.errors import ConfigError, WireError
-from companion.vehicle.autopilot.client import AutopilotClient
-from companion.vehicle.flight import Flight
+from companion.vehicle.autopilot.adapters import open_autopilot
 from companion.vehicle.orders import ORDER_FAULTS, OrderBook
 from companion.vehicle.preflight import own_checks
-from companion.wire.mavlink import MavlinkCodec
+from companion.vehicle.supervisor import Supervisor
 from companion.wire.operator import Answer, Check, Command, PreflightReport, Status, decode_command, encode, unmet
 from companion.wire.peer import (
     WIRE_FAULTS,
@@ -64,7 +62,6 @@ from companion.wire.peer import (
     motion_from_json,
     motion_to_json,
 )
-from companion.wire.px4 import mode_name
 
 TIMER_SLACK = 2.5
 """without a new position the control tick comes this many periods after the last"""
@@ -138,11 +135,14 @@ class Outputs:
     mavlink: list[bytes] = field(default_factory=list)
     peers: list[tuple[str, bytes]] = field(default_factory=list)
     """(topic, payload)"""
-    notes: list[str] = field(default_factory=list)
-    """what happened, for the log"""
     events: list[Event] = field(default_factory=list)
-    """what happened, as values"""
+    """what happened"""
     tick: Tick | None = None
+
+    @property
+    def notes(self) -> list[str]:
+        """What happened, for the log."""
+        return [sentence(event) for event in self.events]
 
 
 class Agent:
@@ -154,16 +154,14 @@ class Agent:
         self.id = vehicle_id
         self.boot_id = boot_id
         self.rejected = Counts(REJECTED)
-        self.link = MavlinkCodec(self.vehicle.system_id)
-        origin = config.origin if config.fleet.frame == "global" else None
-        self.autopilot = AutopilotClient(self.link, origin, config.limits.control_rate_hz)
+        self.autopilot = open_autopilot(config, self.vehicle)
         self.history = TrajectoryHistory([config.first_motion])
         others = frozenset(v.id for v in config.vehicles) - {vehicle_id}
         self.peers = PeerTable(vehicle_id, others, config.peer_limits, self.history)
         self.law: Law = StarlingLaw(config.gains)
         """what is flown, before the filter; tests and studies may put another in its place"""
         self.safety = SafetyFilter(config.safety_limits)
-        self.flight = Flight(config, vehicle_id, self.autopilot, self.history, self.peers, self._restart_filter)
+        self.supervisor = Supervisor(config, self.autopilot, self.history, self.peers, self._restart_filter)
         self.orders = OrderBook(boot_id)
         self.trigger = config.trigger_rule
         self.near = NearMode(config.near_rate)
@@ -213,7 +211,7 @@ class Agent:
     @property
     def phase(self) -> Phase:
         """Where the vehicle is in its flight."""
-        return self.flight.phase
+        return self.supervisor.phase
 
     @property
     def neighbours(self) -> Sequence[Neighbour]:
@@ -227,9 +225,7 @@ class Agent:
         heard = self.autopilot.heard
         if self.autopilot.receive(datagram, now):
             self._position_came = True
-            ap = self.autopilot
-            assert ap.position_ns is not None
-            self.flight.positions.see(ap.position_ns, ap.position_ned_m, ap.velocity_ned_m_s)
+            self.supervisor.position_came()
         return self.autopilot.heard > heard
 
     def receive_peer(self, key: str, payload: bytes, now: Instant) -> None:
@@ -262,7 +258,7 @@ class Agent:
         what = Failsafe.OWN_ID
         self.rejected[what.value] += 1
         if not self.own_id_heard(now):
-            self._outputs.notes.append(f"{what.value}: it says where it is itself")
+            self._outputs.events.append(FailsafeNoted(what, "it says where it is itself"))
         self._own_id_ns = now.monotonic_ns
         if not self._resend_ns:
             self._resend_ns = [max(now.monotonic_ns, self._sent_ns + OWN_ID_ANSWER_NS)]
@@ -312,7 +308,7 @@ class Agent:
             command = decode_command(payload)
         except WireError as fault:
             return self._refuse(Refusal(fault.kind, fault.detail))
-        refusal = self.orders.refusal(command.verb, command.after.get(self.id, ()), self.flight.begun)
+        refusal = self.orders.refusal(command.verb, command.after.get(self.id, ()), self.supervisor.begun)
         if refusal is not None:
             return self._refuse(refusal, in_order=False)
         reason = self._obey(command, now)
@@ -328,13 +324,13 @@ class Agent:
             case "takeoff":
                 return self._command_take_off(now)
             case "land":
-                return self.flight.land(now)
+                return self.supervisor.land(now)
             case "release":
-                return self.flight.release(now)
+                return self.supervisor.release(now)
             case "resume":
-                return self.flight.resume(now)
+                return self.supervisor.resume(now)
             case "kill":
-                return self.flight.kill(now) if command.confirm else "kill needs its confirmation"
+                return self.supervisor.kill(now) if command.confirm else "kill needs its confirmation"
         if not self._commands_budget.open(now.monotonic_ns):
             self.rejected["command: more than can be examined"] += 1
             return "too many motions at once: command it again"
@@ -360,7 +356,7 @@ class Agent:
                 phase=self.phase.name.lower(),
                 in_order=in_order,
                 revision=self.history.newest.revision,
-                place=self.orders.place(self.flight.begun),
+                place=self.orders.place(self.supervisor.begun),
             )
         )
 
@@ -375,22 +371,22 @@ class Agent:
         reasons = self.unready(now)
         if reasons:
             return "; ".join(reasons)
-        return self.flight.take_off(now)
+        return self.supervisor.take_off(now)
 
     def notice(self, failsafe: Failsafe, now: Instant) -> None:
         """Something that only the process around can see: it is noted and counted, and changes nothing."""
         del now
         self.rejected[failsafe.value] += 1
-        self._outputs.notes.append(f"{failsafe.value}: noted")
+        self._outputs.events.append(FailsafeNoted(failsafe, "noted"))
 
     def stop(self, now: Instant) -> None:
         """The process is asked to end: land. `stopped` tells when the autopilot has taken over."""
-        self.flight.land(now)
+        self.supervisor.land(now)
 
     @property
     def stopped(self) -> bool:
         """Whether nothing hangs in the air on this process."""
-        return self.flight.stopped
+        return self.supervisor.stopped
 
     def unready(self, now: Instant) -> list[str]:
         """Why this vehicle may not take off; empty when it may."""
@@ -504,11 +500,9 @@ class Agent:
             self._sent = (self._sent[0], self._reference_of(self._sent[0]))
         if before.returns and not motion.returns and motion.revision > before.revision:
             # Somebody wants something else after it; a motion of the same revision only won a race.
-            self.flight.return_wanted = False
+            self.supervisor.return_is_over()
         self._plan_due_ns = now.monotonic_ns if motion.issuer == self.id else None
         self._mention(now)
-        by = motion.issuer or "the operator"
-        self._outputs.notes.append(f"motion {motion.revision} ({motion.shape}) by {by}")
         self._outputs.events.append(MotionAdopted(motion))
 
     def _compare_motions(self, message: PeerMessage, now: Instant) -> None:
@@ -516,7 +510,7 @@ class Agent:
         ours = self.history.newest.order
         if theirs < ours and self._plan_due_ns is None:
             self._tell_plan_soon(now)
-        self.flight.behind = theirs > ours
+        self.supervisor.heard_order(newer=theirs > ours)
 
     def _tell_plan_soon(self, now: Instant) -> None:
         self._plan_due_ns = now.monotonic_ns + self._random.randrange(self._spread_ns)
@@ -529,11 +523,11 @@ class Agent:
         once, each checked by all, stop a crowd on one machine for a second.
         """
         newest = self.history.newest
-        automatic, flight = self.config.plan.automatic, self.flight
-        up = flight.forms_without or self._all_up()
+        automatic, supervisor = self.config.plan.automatic, self.supervisor
+        up = supervisor.forms_without or self._all_up()
         forms = automatic and newest.revision == 0 and self.phase is Phase.WAITING and up
         flies = automatic and newest.revision == 1 and self._all_formed(now) and not newest.legs
-        returns = (flight.return_wanted and not newest.returns) or (
+        returns = (supervisor.return_wanted and not newest.returns) or (
             newest.then == "return"
             and newest.end_ns is not None
             and self.phase in SETTLED_PHASES
@@ -566,7 +560,7 @@ class Agent:
         if fault is None:
             self._adopt(motion, now)
         else:
-            self.flight.no_way_back(fault.sentence, now)
+            self.supervisor.no_way_back(fault.sentence, now)
 
     def _return_motion(self, start_ns: int) -> FleetTrajectory:
         return self.config.motion_home(self.history.newest, start_ns, self.id)
@@ -617,12 +611,9 @@ class Agent:
         if self._plan_due_ns is not None and now.monotonic_ns >= self._plan_due_ns:
             self._plan_due_ns = None
             out.peers.append(("plan", self._plan_payload))
-        out.notes = [*self.flight.notes, *out.notes, *self.peers.notes, *self.autopilot.notes]
-        self.flight.notes.clear()
-        out.events = [*self.flight.events, *out.events]
-        self.flight.events.clear()
-        self.peers.notes.clear()
-        self.autopilot.notes.clear()
+        out.events = [*self.supervisor.events, *out.events, *self.peers.events, *self.autopilot.events]
+        for part in (self.supervisor, self.peers, self.autopilot):
+            part.events.clear()
         self._outputs = Outputs()
         return out
 
@@ -630,10 +621,10 @@ class Agent:
         came, self._position_came = self._position_came, False
         self._last_tick = now
         dt_s = 0.0 if since_ns is None else since_ns * 1e-9
-        if dt_s > LATE_S and self.flight.steers:
+        if dt_s > LATE_S and self.supervisor.steers:
             self.rejected[Failsafe.LOOP_LATE.value] += 1
-        measured = None if self.flight.positions.frozen else self.autopilot.state(now)
-        self.flight.watch(now, measured is not None)
+        measured = self.supervisor.state(now)
+        self.supervisor.watch(now, measured is not None)
         if self.phase is not self._announced:
             both = {self.phase, self._announced}
             if not both <= FORMATION_PHASES:
@@ -653,8 +644,8 @@ class Agent:
         ego, bias = self._observe(measured, gap_s, now)
         motion = self.history.at(now.fleet_ns)
         moment = motion.state_at(now.fleet_ns)
-        reference = self.flight.follow(moment.slot(motion.slots[self.id]), ego, now)
-        steers = self.flight.steers
+        reference = self.supervisor.follow(moment.slot(motion.slots[self.id]), ego, now)
+        steers = self.supervisor.steers
         if steers or now.monotonic_ns >= self._look_ns:
             self._neighbours = self.peers.predict(
                 ego.position_ned_m, now, moment, self.phase in SETTLED_PHASES, self.phase is Phase.RETURNING
@@ -664,14 +655,14 @@ class Agent:
         residual = ZERO
         steered = False
         if steers:
-            command, residual = self.law.command(ego, reference, neighbours, alone=self.flight.alone)
+            command, residual = self.law.command(ego, reference, neighbours, alone=self.supervisor.detached)
             setpoint = self.safety.apply(command, ego, neighbours, bias, dt_s)
             if setpoint is not None:
-                self._outputs.mavlink.append(self._encode(setpoint))
+                self._outputs.mavlink.append(self.autopilot.setpoint(setpoint))
                 self.setpoints_sent += 1
                 steered = True
             self._look_near(reference.velocity_ned_m_s, now)
-        self.flight.settle(ego, reference, now)
+        self.supervisor.settle(ego, reference, now)
         self._propose(now)
         self._tell(now, residual, reference)
         self._tick = self._outputs.tick = Tick(
@@ -689,8 +680,8 @@ class Agent:
     def _observe(self, measured: tuple[Ned, Ned], dt_s: float, now: Instant) -> tuple[VehicleState, Ned]:
         """The own state without the estimator's velocity bias, and that bias; the filter for sending goes along."""
         position, velocity = measured
-        if self.flight.positions.jumps != self._jumps:
-            self._jumps = self.flight.positions.jumps
+        if self.supervisor.position_jumps != self._jumps:
+            self._jumps = self.supervisor.position_jumps
             self._bias = (BiasObserver(), BiasObserver(), BiasObserver())
             self._filter = (SendFilter(), SendFilter(), SendFilter())
         free = Ned(*(o.step(p, v, dt_s) for o, p, v in zip(self._bias, position, velocity, strict=True)))
@@ -702,18 +693,6 @@ class Agent:
     def _restart_filter(self) -> None:
         """Whatever filter flies starts anew, as the vehicle does: it is the agent's, and nobody else holds it."""
         self.safety.reset()
-
-    def _encode(self, s: SafeSetpoint) -> bytes:
-        frame = self.autopilot.frame
-        assert frame is not None  # a state exists, so the frame does
-        down = frame.to_local(Ned(0.0, 0.0, s.position_down_m)).down
-        return self.link.setpoint(
-            self.autopilot.boot.last_boot_ms,
-            down,
-            Ned(s.velocity_north_m_s, s.velocity_east_m_s, s.velocity_down_m_s),
-            (s.acceleration_north_m_s2, s.acceleration_east_m_s2),
-            s.yaw_rad,
-        )
 
     # -- telling the peers -------------------------------------------------------------------------------------------
 
@@ -779,7 +758,7 @@ class Agent:
             self._resend_ns = [t for t in self._resend_ns if t > now.monotonic_ns]
         if self._sent is None:
             return "first"
-        if due or (self.flight.behind and since_s >= CATCH_UP_NS * 1e-9):
+        if due or (self.supervisor.outdated and since_s >= CATCH_UP_NS * 1e-9):
             return "announced"
         situation = self._situation(self._sent, position, velocity, residual, reference, now)
         if since_s >= self._silence_limit_s:
@@ -794,7 +773,7 @@ class Agent:
     ) -> Situation:  # fmt: skip
         """What the trigger decides upon: the own state against what the peers predict of it."""
         p, v = predict_sample(*sent, reference, now.fleet_ns, self.peers.limits)
-        since_ns = self.flight.formation_since_ns
+        since_ns = self.supervisor.formation_since_ns
         shift_ns = CLOCK_SHIFT_NS * self.vehicle.instance
         return Situation(
             (position.north - p.north) ** 2 + (position.east - p.east) ** 2 + (position.down - p.down) ** 2,
@@ -815,15 +794,15 @@ class Agent:
         return Status(
             vehicle=self.id,
             phase=self.phase.name.lower(),
-            mode=mode_name(self.autopilot.custom_mode),
-            killed=None if self.flight.killed is None else self.flight.killed.value,
+            mode=self.autopilot.mode_name,
+            killed=None if self.supervisor.killed is None else self.supervisor.killed.value,
             armed=self.autopilot.armed,
             ready=[c.message for c in unready],
             unfit=[c.message for c in unready if c.permanent],
             revision=self.history.newest.revision,
             fleet=self.config.fleet.name,
             up_s=0.0 if self._began_ns is None else (now.monotonic_ns - self._began_ns) * 1e-9,
-            place=self.orders.place(self.flight.begun),
+            place=self.orders.place(self.supervisor.begun),
             shape=self.history.newest.shape,
             moving=self.history.newest.end_ns is None or bool(self.history.newest.legs),
             position_error_m=tick.position_error_m if tick else None,
@@ -836,10 +815,8 @@ class Agent:
             battery_percent=self.autopilot.battery(now),
             autopilot_age_s=self.autopilot.heartbeat_age_s(now),
             configuration=self.config.shared_hash,
-            failsafes=self.flight.failsafes[-FAILSAFES_TOLD_MOST:],
-            rejected=dict(
-                self.rejected + self.flight.counts + self.peers.rejected + self.link.rejected + self.autopilot.counts
-            ),
+            failsafes=self.supervisor.failsafes[-FAILSAFES_TOLD_MOST:],
+            rejected=dict(self.rejected + self.supervisor.counts + self.peers.rejected + self.autopilot.rejected),
             limited=dict(self.safety.counts),
             own_id_heard=self.own_id_heard(now),
             motion=motion_to_json(self.history.newest),

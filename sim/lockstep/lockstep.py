@@ -312,7 +312,7 @@ class Lockstep:
         if not isinstance(order, dict) or "after" in order:
             return payload
         self._orders += 1
-        after = {i: [v.agent.orders.place(v.agent.flight.begun)] for i, v in self.vehicles.items()}
+        after = {i: [v.agent.orders.place(v.agent.supervisor.begun)] for i, v in self.vehicles.items()}
         return json.dumps({"issuer": "lockstep", **order, "id": f"{self._orders}", "after": after}).encode()
 
     def stall(self, i: int, seconds: float) -> None:

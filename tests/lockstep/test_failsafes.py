@@ -25,8 +25,7 @@ from pymavlink.dialects.v20 import development as dialect
 from companion.core.failsafe import FAILSAFES, LATE_S, STATUS_S, UNCERTAIN_S, Action, Failsafe
 from companion.core.frames import Ned
 from companion.core.values import Instant, PeerMessage, Phase
-from companion.vehicle.autopilot.client import AutopilotClient
-from companion.vehicle.flight import ON_GROUND
+from companion.vehicle.autopilot.px4 import ON_GROUND, Px4Autopilot
 from companion.wire.peer import encode_state
 from companion.wire.px4 import Px4Mode, mode_parameters
 from sim.autopilot.faults import Fault, FaultKind
@@ -81,7 +80,7 @@ class Scene:
         v = self.ls.vehicles[1]
         v.autopilot = Tampered(v.autopilot, dropped, commands)  # type: ignore[assignment]
 
-    def silence(self, message: int, last: Callable[[AutopilotClient], int | None]) -> None:
+    def silence(self, message: int, last: Callable[[Px4Autopilot], int | None]) -> None:
         """Nothing more of one message; the fault begins as the last of it came."""
         self.tamper(message)
         said_ns = last(self.ls.vehicles[1].agent.autopilot)
@@ -160,7 +159,7 @@ def must_go_on(s: Scene, phase: Phase) -> None:
     """Nothing was done; landing on command ends it."""
     wait(s.ls, 1.0)
     assert s.phase is phase
-    assert s.ls.vehicles[1].agent.flight.failsafes == []
+    assert s.ls.vehicles[1].agent.supervisor.failsafes == []
 
 
 # -- one scenario for each row: what it does is in its name's row; it returns when it was noticed, and the latest ------
@@ -615,7 +614,7 @@ def test_a_position_that_jumps_on_the_ground_is_no_failsafe_in_the_air(when: str
     s.tamper(49)
     s.inject(FaultKind.ESTIMATOR_RESET)
     wait(ls, 0.5)
-    assert s.ls.vehicles[1].agent.flight.positions.jumps == 1
+    assert s.ls.vehicles[1].agent.supervisor.position_jumps == 1
     s.tamper()
     if when == "disarmed":
         wait(ls, 2.0)

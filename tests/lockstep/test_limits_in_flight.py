@@ -173,7 +173,7 @@ def test_the_filter_that_flies_is_the_one_that_starts_anew_whatever_is_put_in_it
     agent, ls = flown.agent, flown.ls
     watched = agent.safety = Watched(agent.config.safety_limits, acceleration_m_s2=(5.0, -5.0))
     ls.command(b'{"verb":"takeoff"}')
-    until(ls, 20.0, lambda: agent.phase is Phase.CLIMBING and agent.flight.steers)
+    until(ls, 20.0, lambda: agent.phase is Phase.CLIMBING and agent.supervisor.steers)
     assert watched.started == 1
     assert abs(watched.acceleration_m_s2[0]) < 1.0, "what was flown before is forgotten"
     until(ls, 20.0, lambda: agent.phase is Phase.WAITING)
