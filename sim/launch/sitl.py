@@ -11,6 +11,7 @@ import re
 import select
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import time
@@ -22,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pymavlink.dialects.v20 import development as mavlink
 
 from companion.config import FleetConfig
 from companion.config.derived import Vehicle
@@ -30,8 +32,7 @@ from companion.core.frames import Geodetic, Ned, geodetic_to_ned, ned_to_geodeti
 from companion.errors import CompanionError, ConfigError
 from companion.io.link import SO_TIMESTAMPNS, received_unix_ns
 from companion.vehicle.autopilot.px4_versions import same_setting
-from companion.wire.mavlink import dialect as mavlink
-from companion.wire.mavlink import interval_parameters, parameter_value
+from companion.wire.px4 import interval_parameters, parameter_value
 from sim.autopilot.stubs import TRUTH_DTYPE
 
 GCS_PORT = 14550
@@ -357,7 +358,7 @@ class SitlHost:
                 case mavlink.MAVLink_extended_sys_state_message():
                     instance.landed_state = message.landed_state
                 case mavlink.MAVLink_param_value_message():
-                    instance.checked[message.param_id.rstrip("\x00")] = parameter_value(message)
+                    instance.checked[message.param_id.rstrip("\x00")] = _value_of(message)
 
     def _read_truth(self, instance: _Instance) -> None:
         rows = []
@@ -432,3 +433,7 @@ def _other_name_set(instance: _Instance, name: str) -> bool:
 
 
 __all__ = ["FLEET_PARAMETERS", "Px4Instance", "SitlHost", "SitlSettings", "check_build"]
+
+
+def _value_of(message: Any) -> float | int:
+    return parameter_value(struct.pack("<f", message.param_value), message.param_type)

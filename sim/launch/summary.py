@@ -24,8 +24,8 @@ from companion.io.loop import TICK_RECORD, TRAFFIC_RECORD
 from companion.io.recorder import Entry, RecordingError, read_recording
 from companion.wire import operator as protocol
 from companion.wire.events import decode_event
-from companion.wire.mavlink import Px4Mode
 from companion.wire.peer import encode_motion
+from companion.wire.px4 import Px4Mode
 from sim.measures import algebraic_connectivity, centroid_error_m, formation_error_m, velocity_error_m_s
 
 Array = npt.NDArray[Any]
