@@ -21,6 +21,10 @@ class Ned(NamedTuple):
     down: float
 
 
+new = tuple.__new__
+"""`new(Ned, (n, e, d))` is `Ned(n, e, d)` for half its cost: used where every peer needs several at every tick"""
+
+
 @dataclass(frozen=True, slots=True)
 class Geodetic:
     """A point on the WGS84 ellipsoid."""

@@ -316,15 +316,16 @@ class Agent:
         now: Instant,
     ) -> None:  # fmt: skip
         """Report what this tick did."""
+        here = ego.position_ned_m
         self._last_tick = self._outputs.tick = TickReport(
             now,
             came,
-            dist(ego.position_ned_m, reference.position_ned_m),
-            sum(n.in_formation for n in neighbours),
-            min((dist(n.position_ned_m, ego.position_ned_m) for n in neighbours), default=-1.0),
+            dist(here, reference.position_ned_m),
+            sum([n.in_formation for n in neighbours]),
+            min([dist(n.position_ned_m, here) for n in neighbours], default=-1.0),
             self.safety.acceleration_m_s2,
             steered,
-            ego.position_ned_m,
+            here,
             ego.velocity_ned_m_s,
         )
 

@@ -45,9 +45,12 @@ class StateObserver:
     @property
     def bias_m_s(self) -> Ned:
         """The estimator's velocity bias."""
-        return Ned(*(axis.bias_m_s for axis in self._bias))
+        north, east, down = self._bias
+        return Ned(north.bias_m_s, east.bias_m_s, down.bias_m_s)
 
     @property
     def smoothed(self) -> tuple[Ned, Ned]:
         """Position and velocity as they are compared by the trigger and sent to the peers; zero before the first."""
-        return Ned(*(a.position_m or 0.0 for a in self._smooth)), Ned(*(a.velocity_m_s for a in self._smooth))
+        north, east, down = self._smooth
+        position = Ned(north.position_m or 0.0, east.position_m or 0.0, down.position_m or 0.0)
+        return position, Ned(north.velocity_m_s, east.velocity_m_s, down.velocity_m_s)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from companion.core.frames import Ned
+from companion.core.frames import Ned, new
 from companion.core.monitor import PeerMotion
 from companion.core.prediction import HoldKind, axis, weights
 from companion.core.trajectory.fleet import Reference
@@ -56,7 +56,7 @@ def predict_sample(
         x, vx = axis(p.north, v.north, then_p.north, then_v.north, now_p.north, now_v.north, w)
         y, vy = axis(p.east, v.east, then_p.east, then_v.east, now_p.east, now_v.east, w)
         z, vz = axis(p.down, v.down, then_p.down, then_v.down, now_p.down, now_v.down, w)
-        return Ned(x, y, z), Ned(vx, vy, vz)
+        return new(Ned, (x, y, z)), new(Ned, (vx, vy, vz))
     if sample.phase in (Phase.ARMED, Phase.CLIMBING, Phase.LANDING):
         w = weights("damped", tau_s, VERTICAL_DAMPING_S)
         return Ned(p.north, p.east, p.down + w.position * v.down), Ned(0.0, 0.0, w.velocity * v.down)

@@ -11,7 +11,7 @@ from math import dist, isfinite
 from companion.core.counts import Counts
 from companion.core.events import PeerDoubted
 from companion.core.failsafe import SUSPECT_S, Failsafe
-from companion.core.frames import Ned
+from companion.core.frames import Ned, new
 from companion.core.neighbours import examination, silence
 from companion.core.neighbours.gates import GATE_PERIOD_NS, outliers
 from companion.core.neighbours.lost import nearest_piece
@@ -260,9 +260,14 @@ class PeerTable:
         None if nobody ever was heard. Whoever is still said to be there but says nothing counts as silent, in whatever
         phase it was.
         """
-        newest = [p.tracks[0] for p in self._peers.values() if p.tracks]
-        ends = [t.due_ns if t.lost_at_ns is None else t.lost_at_ns for t in newest]
-        return max(now.fleet_ns - max(ends), 0) * 1e-9 if ends else None
+        newest_ns: int | None = None
+        for peer in self._peers.values():
+            if peer.tracks:
+                track = peer.tracks[0]
+                end_ns = track.due_ns if track.lost_at_ns is None else track.lost_at_ns
+                if newest_ns is None or end_ns > newest_ns:
+                    newest_ns = end_ns
+        return None if newest_ns is None else max(now.fleet_ns - newest_ns, 0) * 1e-9
 
     def digest(self) -> tuple[PeerSample, ...]:
         """The latest samples of peers for passing on, newest first; none of a peer that is lost, or in two places."""
@@ -287,9 +292,10 @@ class PeerTable:
     ) -> list[Neighbour]:
         """Every known peer within range, predicted to now under the plan at that `moment`, in the order of the ids.
 
-        One that may be in two places is there twice. With `gated` (only once formed), peers whose prediction is far
-        from what the others' say drop from alignment and cohesion; they still count for separation. With `above_ground`
-        (before landing) the place above one that stands on the ground or lands is taken too, up to the own altitude.
+        Of a lost one the nearest place where it may be must be within range. One that may be in two places is there
+        twice. With `gated` (only once formed), peers whose prediction is far from what the others' say drop from
+        alignment and cohesion; they still count for separation. With `above_ground` (before landing) the place above
+        one that stands on the ground or lands is taken too, up to the own altitude.
         """
         slots = self.history.at(now.fleet_ns).slots
         own = moment.slot(slots[self.own_id]).position_ned_m
@@ -305,7 +311,10 @@ class PeerTable:
                 if above_ground and track.sample.phase in LOW_PHASES:
                     p = n.position_ned_m
                     n = n._replace(last_seen_ned_m=p._replace(down=min(p.down, ego_ned_m.down)))
-                if self._in_range(n, ego_ned_m):
+                place = n.position_ned_m
+                if n.last_seen_ned_m is not None:
+                    place = lerp(place, n.last_seen_ned_m, closest_point_parameter(ego_ned_m, place, n.last_seen_ned_m))
+                if dist(place, ego_ned_m) <= self.limits.range_m:
                     neighbours.append(n)
         if not gated:
             return neighbours
@@ -315,13 +324,6 @@ class PeerTable:
         if not self._gated:
             return neighbours
         return [n._replace(in_formation=False) if n.vehicle_id in self._gated else n for n in neighbours]
-
-    def _in_range(self, n: Neighbour, ego_ned_m: Ned) -> bool:
-        """Whether it may be within range: for a lost peer, the nearest place between its two ends."""
-        place, other = n.position_ned_m, n.last_seen_ned_m
-        if other is not None:
-            place = lerp(place, other, closest_point_parameter(ego_ned_m, place, other))
-        return dist(place, ego_ned_m) <= self.limits.range_m
 
     def _predict(
         self, peer: Peer, track: Track, ego_ned_m: Ned, now: Instant, reference: Reference, own: Ned
@@ -352,18 +354,11 @@ class PeerTable:
             and now.fleet_ns >= peer.twofold_until_ns
         )
         slot = reference.position_ned_m
-        # By place: naming the fields costs as much again, for every peer at every tick.
-        return Neighbour(
-            sample.vehicle_id,
-            position,
-            velocity,
-            Ned(own.north - slot.north, own.east - slot.east, own.down - slot.down),
-            tau_s,
-            sound,
-            sound,
-            uncertainty,
-            other_end,
-            reference.velocity_ned_m_s,
-            reference.acceleration_ned_m_s2,
-            peer.told,
-        )
+        offset = new(Ned, (own.north - slot.north, own.east - slot.east, own.down - slot.down))
+        return new(
+            Neighbour,
+            (
+                sample.vehicle_id, position, velocity, offset, tau_s, sound, sound, uncertainty, other_end,
+                reference.velocity_ned_m_s, reference.acceleration_ned_m_s2, peer.told,
+            ),
+        )  # fmt: skip

@@ -11,7 +11,7 @@ from functools import cached_property
 from math import atan2, cos, hypot, inf, sin
 from typing import Literal, NamedTuple
 
-from companion.core.frames import Ned
+from companion.core.frames import Ned, new
 from companion.core.trajectory.goto import goto_peaks
 from companion.core.trajectory.legs import (
     TURN_RAMP_S,
@@ -64,7 +64,7 @@ class TrajectoryState(NamedTuple):
         dn, de = c * forward - s * right, s * forward + c * right
         if rate == bend == m1 == m2 == 0.0:
             # Slots at rest in a formation that does not turn, which is most of a flight: all move as the centre does.
-            return Reference(Ned(p.north + dn, p.east + de, p.down + d0 + m * dd), v, a, heading)
+            return new(Reference, (new(Ned, (p.north + dn, p.east + de, p.down + d0 + m * dd)), v, a, heading))
         wn, we = c * df - s * dr, s * df + c * dr
         return Reference(
             Ned(p.north + dn, p.east + de, p.down + d0 + m * dd),
