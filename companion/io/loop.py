@@ -30,8 +30,9 @@ from companion.io.recorder import Recorder
 from companion.io.systemd import Notifier
 from companion.io.traffic import tcp_bytes_sent
 from companion.io.zenoh_peers import PeerMessage, PeerNetwork, PeerNetworkSettings, PresenceChange, Request
-from companion.vehicle.agent import Agent, Outputs
-from companion.vehicle.border import Border
+from companion.vehicle.agent import Agent
+from companion.vehicle.guard import Guard
+from companion.vehicle.outputs import Outputs
 from companion.wire.events import encode_event
 from companion.wire.operator import CLOCK_QUESTION, ClockReading, encode
 
@@ -99,7 +100,7 @@ class Companion:
         self.settings = settings
         self.boot_id = secrets.randbits(32)
         self.agent = Agent(config, settings.vehicle_id, self.boot_id)
-        self.border = Border(self.agent)
+        self.guard = Guard(self.agent)
         self.clock = FleetClock()
         self._wake_read, self._wake_write = socket.socketpair()
         self._wake_read.setblocking(False)
@@ -154,7 +155,7 @@ class Companion:
             self._noticed.add(failsafe)
             now = self._instant(now_ns)
             self._record("input/notice", now, failsafe.name.encode())
-            self.border.notice(failsafe, now)
+            self.guard.notice(failsafe, now)
 
     def close(self) -> None:
         """Release everything, the Zenoh session first."""
@@ -166,7 +167,7 @@ class Companion:
         stop_by_ns = now.monotonic_ns + round(grace_s * 1e9)
         if self._stop_by_ns is None:
             self._record("input/stop", now, b"")
-            self.border.stop(now)
+            self.guard.stop(now)
             self._stop_by_ns = stop_by_ns
             self._notifier.stopping()
         self._stop_by_ns = min(self._stop_by_ns, stop_by_ns)
@@ -174,7 +175,7 @@ class Companion:
     def run(self) -> int:
         """Run until stopped; 0 if the vehicle was safe then, 3 if it still flew without a confirmed landing.
 
-        4 at once if control ticks do nothing but raise (`border`): the autopilot's failsafe has the vehicle then.
+        4 at once if control ticks do nothing but raise (`guard`): the autopilot's failsafe has the vehicle then.
         """
         asked: list[bool] = []
         waiting: list[Any] = [self.link, self._wake_read]
@@ -191,7 +192,7 @@ class Companion:
         with _signals(ask):
             self._notifier.ready()
             while True:
-                deadline_ns = min(self.border.next_deadline_ns(), self._second_ns)
+                deadline_ns = min(self.guard.next_deadline_ns(), self._second_ns)
                 ready, _, _ = select.select(waiting, [], [], max(deadline_ns - time.monotonic_ns(), 0) * 1e-9)
                 requests = self._receive(ready)
                 if asked:
@@ -206,7 +207,7 @@ class Companion:
                     self._reply(request)
                 now_ns = time.monotonic_ns()
                 self._tell_raised(now_ns)
-                if self.border.lost(now_ns):
+                if self.guard.lost(now_ns):
                     return LOST
                 if now_ns >= self._second_ns:
                     self._each_second(now_ns)
@@ -229,9 +230,10 @@ class Companion:
                     continue
                 now = self._instant(received_ns)
                 self._record("input/mavlink", now, datagram)
-                if self.border.receive_mavlink(datagram, now):
+                heard = self.guard.receive_mavlink(datagram, now)
+                if heard.autopilot:
                     self.link.confirm(address, received_ns)
-                if self._driver_ns is None and self.agent.next_deadline_ns() == 0:
+                if heard.position and self._driver_ns is None:
                     self._driver_ns = received_ns
         if self._wake_read in ready:
             self._wake_read.recv(4096)
@@ -241,20 +243,20 @@ class Companion:
             match event:
                 case PeerMessage():
                     self._record("input/peer", now, event.key.encode() + b"\0" + event.payload)
-                    self.border.receive_peer(event.key, event.payload, now)
+                    self.guard.receive_peer(event.key, event.payload, now)
                 case PresenceChange():
                     self._record("input/presence", now, bytes((event.vehicle_id, event.alive)))
-                    self.border.receive_presence(event.vehicle_id, event.alive, now)
+                    self.guard.receive_presence(event.vehicle_id, event.alive, now)
                 case Request():
                     requests.append(event)
         return requests
 
     def _advance(self, deadline_ns: int) -> None:
-        if self.border.next_deadline_ns() > time.monotonic_ns():
+        if self.guard.next_deadline_ns() > time.monotonic_ns():
             return
         now = self._instant(time.monotonic_ns())
         self._record("advance", now, b"")
-        out = self.border.advance(now)
+        out = self.guard.advance(now)
         for datagram in out.mavlink:
             self.link.send(datagram)
         sent_ns = time.monotonic_ns()
@@ -265,7 +267,7 @@ class Companion:
 
     def _tell_raised(self, now_ns: int) -> None:
         """Log and record what was raised for the first time."""
-        notes, self.border.notes = self.border.notes, []
+        notes, self.guard.notes = self.guard.notes, []
         for note in notes:
             self._record("note", self._instant(now_ns), f"raised: {note}".encode())
             with suppress(OSError):
@@ -296,17 +298,17 @@ class Companion:
         now = self._instant(time.monotonic_ns())
         if request.kind == "command":
             self._record("input/command", now, request.payload)
-            answer = self.border.receive_command(request.payload, now)
+            answer = self.guard.receive_command(request.payload, now)
             self._record("output/answer", now, answer)
             self._status = None
             request.reply(answer)
             return
         if request.kind == "preflight":
-            told = self.border.reply("preflight", lambda: self._preflight(request, now))
+            told = self.guard.reply("preflight", lambda: self._preflight(request, now))
         else:
             if self._status is None or now.monotonic_ns - self._status_ns > STATUS_LASTS_NS:
                 self._status, self._status_ns = (
-                    self.border.reply("status", lambda: self._make_status(now)),
+                    self.guard.reply("status", lambda: self._make_status(now)),
                     now.monotonic_ns,
                 )
             told = self._status
@@ -322,7 +324,7 @@ class Companion:
             "peer: malformed": counters.malformed,
         }
         rejected = {kind: count for kind, count in elsewhere.items() if count}
-        rejected |= {f"raised: {kind}": count for kind, count in self.border.raised.items()}
+        rejected |= {f"raised: {kind}": count for kind, count in self.guard.raised.items()}
         return encode(
             replace(
                 status,
@@ -339,7 +341,7 @@ class Companion:
             answered_ns = self.clock.now().fleet_ns
             reading = ClockReading(boot_id=self.boot_id, received_ns=received_ns, answered_ns=answered_ns)
             return encode(reading)
-        return encode(self.agent.account(now))
+        return encode(self.agent.operator.preflight_report(now))
 
     def _each_second(self, now_ns: int) -> None:
         self._second_ns = now_ns + 1_000_000_000

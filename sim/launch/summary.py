@@ -16,7 +16,8 @@ import numpy.typing as npt
 
 from companion.config import FleetConfig
 from companion.core.events import Event, FailsafeActed, Killed, MotionAdopted, PhaseChanged
-from companion.core.trajectory import FleetTrajectory, TrajectoryHistory
+from companion.core.trajectory.fleet import FleetTrajectory
+from companion.core.trajectory.history import TrajectoryHistory
 from companion.core.values import FLYING_PHASES, Phase
 from companion.errors import WireError
 from companion.io.loop import TICK_RECORD, TRAFFIC_RECORD

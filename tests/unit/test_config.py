@@ -17,7 +17,7 @@ from companion.config.endpoints import autopilot_port, companion_port, serial_en
 from companion.config.file import parse
 from companion.config.overrides import plan_legs, resize
 from companion.core.safety.fence import Fence
-from companion.core.trajectory import GotoLeg, TurnLeg, VelocityLeg
+from companion.core.trajectory.legs import GotoLeg, TurnLeg, VelocityLeg
 from companion.errors import ConfigError
 
 DEFAULT = Path(__file__).resolve().parents[2] / "fleet.toml"
