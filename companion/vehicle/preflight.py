@@ -1,6 +1,6 @@
 """Preflight: what must be true of one vehicle before it takes off. Pure; every check is a row with its value and limit.
 
-A vehicle makes these rows of itself and takes off only if all are met, whoever asks. `preflight_fleet` compares what
+A vehicle makes these rows of itself and takes off only if all are met, whoever asks. `operator.preflight` compares what
 the vehicles say of themselves.
 """
 

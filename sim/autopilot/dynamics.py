@@ -225,8 +225,8 @@ def constrain_horizontal(
 class Vehicle:
     """One multicopter's true motion. Mutable; the frame's origin is the caller's, `ground_down_m` is the floor in it.
 
-    The controller works on an estimate: true position plus `position_error`, true velocity plus `velocity_error`, set
-    by the caller before each step, and set-points are in the frame of that estimate.
+    The controller works on an estimate: true position plus `position_error_*_m`, true velocity plus
+    `velocity_error_*_m_s`, set by the caller before each step, and set-points are in the frame of that estimate.
     """
 
     __slots__ = (
