@@ -35,7 +35,8 @@ def run(
     Exit status: 0 ended with the vehicle landed or landing, 2 wrong usage or configuration, 3 ended while the autopilot
     had not confirmed landing, 4 could do nothing any more (a fault of ours; the autopilot's failsafe has the vehicle).
     """
-    from companion.io.loop import Companion, RunSettings
+    from companion.io.loop import RunSettings
+    from companion.io.process import run_companion
 
     def log(text: str) -> None:
         # Not through a buffer, which on a full disk would fail again at the end and change the exit status.
@@ -43,12 +44,8 @@ def run(
 
     config = load(fleet)
     settings = RunSettings(vehicle, record, sys.stdin.fileno() if launched else None, log, fleet)
-    companion = Companion(config, settings, {"config": fleet.read_text(), "version": version("starling-fleet")})
-    try:
-        status = companion.run()
-    finally:
-        companion.close()
-    raise typer.Exit(status)
+    metadata = {"config": fleet.read_text(), "version": version("starling-fleet")}
+    raise typer.Exit(run_companion(config, settings, metadata))
 
 
 @app.command()

@@ -301,12 +301,11 @@ def study(
 
 def _operate(fleet: Path, vehicles: int | None, verb: str, act: Callable[[Any], Any], both: bool = False) -> None:
     from companion.config.file import parse
-    from companion.io.loop import network_settings
-    from companion.io.zenoh_peers import OperatorLink
+    from companion.io.network import operator_link
     from companion.operator.client import Operator
 
     config = parse(_tables(fleet, vehicles), fleet.name)
-    with OperatorLink(network_settings(config, None)) as link:
+    with operator_link(config) as link:
         operator = Operator(config, link, both=both)
         link.wait_alive(operator.ids, 2.0)
         answers = act(operator)
@@ -322,13 +321,12 @@ def status(
 ) -> None:
     """Each vehicle's account of itself. Exit status 1 if one is silent."""
     from companion.config.file import parse
-    from companion.io.loop import network_settings
-    from companion.io.zenoh_peers import OperatorLink
+    from companion.io.network import operator_link
     from companion.operator.client import Operator
     from sim.launch.view import show_status
 
     config = parse(_tables(fleet, vehicles), fleet.name)
-    with OperatorLink(network_settings(config, None)) as link:
+    with operator_link(config) as link:
         operator = Operator(config, link)
         link.wait_alive(operator.ids, 2.0)
         answers = operator.status()
@@ -354,13 +352,12 @@ def preflight(
     Exit status: 0 it may, 1 it may not (each fault is named), 2 wrong usage or configuration.
     """
     from companion.config.file import parse
-    from companion.io.loop import network_settings
-    from companion.io.zenoh_peers import OperatorLink
+    from companion.io.network import operator_link
     from companion.operator.client import Operator
     from sim.launch.view import show_preflight
 
     config = parse(_tables(fleet, vehicles), fleet.name)
-    with OperatorLink(network_settings(config, None)) as link:
+    with operator_link(config) as link:
         operator = Operator(config, link)
         link.wait_alive(operator.ids, 2.0)
         report = operator.preflight()

@@ -55,7 +55,7 @@ CLOCK_SURE_SHARE = 0.25
 
 
 class Link(Protocol):
-    """How questions reach the vehicles (`io.zenoh_peers.OperatorLink`)."""
+    """How questions reach the vehicles (`io.transport.OperatorLink`)."""
 
     def ask(
         self, vehicle_ids: Iterable[int], kind: str, payload: bytes, timeout_s: float, retry_s: float

@@ -20,8 +20,7 @@ import tomli_w
 from companion.config import FleetConfig
 from companion.config.file import parse
 from companion.errors import CompanionError, RefusedError
-from companion.io.loop import network_settings
-from companion.io.zenoh_peers import OperatorLink
+from companion.io.network import operator_link
 from companion.operator.client import Answers, Operator, PreflightError
 from sim.autopilot.stubs import TRUTH_DTYPE
 from sim.launch.faults import ScheduledFault, order_fault
@@ -209,7 +208,7 @@ def _fly(
         if len(ids) > CROWD:
             _lower_priority(process.pid)
         _wait_imported(processes, folder, ids, lambda: show(_starting(began, ids)), interrupted)
-    with OperatorLink(network_settings(config, None)) as link:
+    with operator_link(config) as link:
         operator = Operator(config, link)
         watch = Watch(operator, processes, ids, show, began, ready=ready)
         answers = watch.take_off(READY_TIMEOUT_S + READY_TIMEOUT_PER_VEHICLE_S * len(ids), interrupted)

@@ -22,8 +22,8 @@ from companion.core.monitor import algebraic_connectivity, centroid_error_m, for
 from companion.core.trajectory import FleetTrajectory, TrajectoryHistory
 from companion.core.values import FLYING_PHASES, Phase
 from companion.errors import WireError
-from companion.io.loop import TICK_RECORD, TRAFFIC_RECORD
 from companion.io.recorder import Entry, RecordingError, read_recording
+from companion.io.records import TickRecord, TrafficRecord
 from companion.vehicle.orders import Order, read_order
 from companion.wire.events import decode_event
 from companion.wire.mavlink import Px4Mode
@@ -97,7 +97,7 @@ class Flight:
     events: list[tuple[int, int, Event]] = field(default_factory=list)
     """(time, vehicle, what happened)"""
     ticks: dict[int, Array] = field(default_factory=dict)
-    """vehicle -> rows of fleet ns and the fields of TICK_RECORD"""
+    """vehicle -> rows of fleet ns and the fields of TickRecord"""
     traffic: dict[int, Array] = field(default_factory=dict)
     """vehicle -> rows of (fleet ns, bytes sent)"""
     rejected: Counter[str] = field(default_factory=Counter)
@@ -143,9 +143,9 @@ class Flight:
         try:
             match entry.channel:
                 case "tick":
-                    ticks.append((now, *TICK_RECORD.unpack(entry.body)))
+                    ticks.append((now, *TickRecord.unpack(entry.body)))
                 case "traffic":
-                    traffic.append((now, *TRAFFIC_RECORD.unpack(entry.body)))
+                    traffic.append((now, *TrafficRecord.unpack(entry.body)))
                 case "event":
                     self.events.append((now, vehicle_id, decode_event(entry.body)))
                 case "output/peer":

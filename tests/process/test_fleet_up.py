@@ -52,10 +52,10 @@ from companion.core.frames import Ned
 from companion.core.values import PeerMessage, PeerSample, Phase
 from companion.io.recorder import read_recording
 from companion.io.replay import replay_file
-from companion.io.zenoh_peers import (
+from companion.io.zenoh.configuration import (
     PLANS_HZ,
     REQUESTS_HZ,
-    PeerNetworkSettings,
+    SessionSettings,
     scouting_port,
     zenoh_configuration,
 )
@@ -137,7 +137,7 @@ class Flown:
 
 def put_garbage(fleet: Fleet) -> None:
     """Peers' payloads that no vehicle may take, through a session of the fleet's own namespace."""
-    settings = PeerNetworkSettings(fleet.config.fleet.name, None, scouting_port=fleet.config.peers.scouting_port)
+    settings = SessionSettings(fleet.config.fleet.name, None, scouting_port=fleet.config.peers.scouting_port)
 
     def state(vehicle_id: int, ahead_s: float = 0.0) -> bytes:
         at_ns = time.time_ns() + round(ahead_s * 1e9)

@@ -1,0 +1,73 @@
+"""The operator's questions, answered by the vehicle's loop once what cannot wait is done."""
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+from companion.core.values import Instant
+from companion.io.clock import FleetClock
+from companion.io.transport import Request
+from companion.vehicle.border import Border
+from companion.vehicle.preflight import ClockReading
+
+STATUS_LASTS_NS = 50_000_000
+"""a status this old is told again: making one takes a good part of a control period; a command makes it anew"""
+
+
+class Answers:
+    """`process_facts` are what a status says of the process around the agent."""
+
+    def __init__(
+        self,
+        border: Border,
+        clock: FleetClock,
+        process_facts: Callable[[Instant], dict[str, Any]],
+        record: Callable[[str, Instant, bytes], None],
+    ) -> None:
+        self._border = border
+        self._clock = clock
+        self._process_facts = process_facts
+        self._record = record
+        self._status: bytes | None = None
+        self._status_ns = 0
+
+    def answer(self, request: Request, now: Instant) -> None:
+        """Answer one question; one that raises stays without an answer, and whoever asked asks again."""
+        match request.kind:
+            case "command":
+                answer: bytes | None = self._command(request.payload, now)
+            case "preflight":
+                answer = self._border.reply("preflight", lambda: self._preflight(request, now))
+            case _:
+                answer = self._recent_status(now)
+        if answer is not None:
+            request.reply(answer)
+
+    def _command(self, payload: bytes, now: Instant) -> bytes:
+        self._record("input/command", now, payload)
+        answer = self._border.receive_command(payload, now)
+        self._record("output/answer", now, answer)
+        self._status = None
+        return answer
+
+    def _preflight(self, request: Request, now: Instant) -> bytes:
+        agent = self._border.agent
+        if request.payload != b"clock":
+            return agent.account(now).model_dump_json().encode()
+        received_ns = self._clock.at(request.received_monotonic_ns).fleet_ns
+        answered_ns = self._clock.now().fleet_ns
+        reading = ClockReading(boot_id=agent.boot_id, received_ns=received_ns, answered_ns=answered_ns)
+        return reading.model_dump_json().encode()
+
+    def _recent_status(self, now: Instant) -> bytes | None:
+        if self._status is None or now.monotonic_ns - self._status_ns > STATUS_LASTS_NS:
+            self._status = self._border.reply("status", lambda: self._make_status(now))
+            self._status_ns = now.monotonic_ns
+        return self._status
+
+    def _make_status(self, now: Instant) -> bytes:
+        status = self._border.agent.status(now)
+        facts = self._process_facts(now)
+        rejected = {**status["rejected"], **facts.pop("rejected")}
+        rejected |= {f"raised: {kind}": count for kind, count in self._border.raised.items()}
+        return json.dumps({**status, **facts, "rejected": rejected}).encode()
