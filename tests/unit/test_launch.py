@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from companion.errors import CompanionError
-from sim.launch.launch import LANDING_TIMEOUT_S, POLL_S, UNHEARD_S, Progress, Watch
 from sim.launch.sitl import ENDED_FILE, read_ended, tell_ended
+from sim.launch.watch import LANDING_TIMEOUT_S, POLL_S, UNHEARD_S, Progress, Watch
 
 Said = dict[int, dict[str, Any] | None]
 
