@@ -139,7 +139,7 @@ def up(
     from sim.launch.faults import load_scenario
     from sim.launch.launch import FlightOptions, flight_folder, fly
     from sim.launch.lock import only_flight, refuse_companions
-    from sim.launch.sitl import check_build, parse_parameters
+    from sim.launch.px4_instance import check_build, parse_parameters
     from sim.launch.view import FlightView, show_summary
 
     if autopilot not in ("stub", "px4", "external"):
@@ -266,7 +266,8 @@ def sitl(
 ) -> None:
     """Run PX4 SITL instances until standard input closes: for launchers."""
     from companion.config.file import parse
-    from sim.launch.sitl import SitlHost, SitlSettings, check_build, parse_parameters
+    from sim.launch.px4_instance import check_build, parse_parameters
+    from sim.launch.sitl import SitlHost, SitlSettings
 
     config = parse(_tables(fleet), fleet.name)
     parameters = parse_parameters(parameter or ())

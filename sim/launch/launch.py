@@ -24,7 +24,8 @@ from sim.autopilot.stubs import TRUTH_DTYPE
 from sim.launch.faults import ScheduledFault
 from sim.launch.processes import END_TIMEOUT_S, FleetProcesses
 from sim.launch.reference_loop import read_reference_loop
-from sim.launch.summary import Flight, summarise
+from sim.launch.summary.flight import Flight
+from sim.launch.summary.summarise import summarise
 from sim.launch.watch import MissingError, Progress, Watch
 
 READY_TIMEOUT_S = 30.0

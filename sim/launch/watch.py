@@ -8,9 +8,9 @@ from typing import Any
 
 from companion.errors import CompanionError
 from companion.operator.client import Answers, Operator, PreflightError
+from sim.launch.ended import read_ended
 from sim.launch.faults import ScheduledFault, order_fault
 from sim.launch.processes import FleetProcesses
-from sim.launch.sitl import read_ended
 
 MISSING_AFTER_S = 12.0
 """a vehicle that nobody has heard by then is named as missing: after 15 s with the start of everything"""

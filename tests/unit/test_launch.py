@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from companion.errors import CompanionError
-from sim.launch.sitl import ENDED_FILE, read_ended, tell_ended
+from sim.launch.ended import ENDED_FILE, read_ended, tell_ended
 from sim.launch.watch import LANDING_TIMEOUT_S, POLL_S, UNHEARD_S, Progress, Watch
 
 Said = dict[int, dict[str, Any] | None]
