@@ -186,7 +186,7 @@ class FlightView:
                     self._sent[i] = (progress.elapsed_s, sent)
         fleet = progress.vehicles
         head = f"{progress.elapsed_s:6.1f} s  {progress.doing}: {_phases(fleet)}{_nearest(fleet)}"
-        ended = [f"companion {i} ({how_it_ended(s)})" for i, s in sorted(progress.ended.items())]
+        ended = [f"companion {i}, {how_it_ended(s)}" for i, s in sorted(progress.ended.items())]
         ended += [f"vehicle {i}: {how}" for i, how in sorted(progress.autopilots_ended.items())]
         lines = [head, *([f"ended: {', '.join(ended)}"] if ended else [])]
         if self._live is not None:
