@@ -1,9 +1,10 @@
-"""What happens to a vehicle in flight, as values: a flight is judged by these, and text is made where it is shown."""
+"""What happens to a vehicle in flight, as values: a flight is judged by these, and `sentence` makes text of them."""
 
 from dataclasses import dataclass
 from enum import Enum, unique
 
-from companion.core.failsafe import Failsafe
+from companion.core.failsafe import Action, Failsafe
+from companion.core.phase import PhaseEvent
 from companion.core.trajectory import FleetTrajectory
 from companion.core.values import Phase
 
@@ -22,6 +23,7 @@ class PhaseChanged:
 
     before: Phase
     after: Phase
+    why: PhaseEvent
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,8 +38,49 @@ class FailsafeActed:
     """A failsafe was noticed and acted on."""
 
     failsafe: Failsafe
-    sentence: str
-    """what failed, in which way, and what was done"""
+    action: Action
+    detail: str
+    """in which way it failed; may be empty"""
+
+    @property
+    def sentence(self) -> str:
+        """What failed, in which way, and what was done."""
+        return ": ".join(x for x in (self.failsafe.value, self.detail, self.action.value) if x)
+
+
+@dataclass(frozen=True, slots=True)
+class FailsafeNoted:
+    """A failsafe was noticed, and calls for no action."""
+
+    failsafe: Failsafe
+    detail: str
+
+
+@dataclass(frozen=True, slots=True)
+class PeerDoubted:
+    """A peer's states cannot all be true."""
+
+    vehicle_id: int
+    failsafe: Failsafe
+    detail: str
+    """what is done about it"""
+
+
+@dataclass(frozen=True, slots=True)
+class NoWayBack:
+    """The fleet's way back to its pads cannot be flown: the vehicle lands where it is."""
+
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class KillCommanded:
+    """The operator has the motors stopped."""
+
+
+@dataclass(frozen=True, slots=True)
+class KillGivenUp:
+    """The autopilot did not stop the motors."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,4 +90,74 @@ class Killed:
     cause: KillCause
 
 
-Event = PhaseChanged | MotionAdopted | FailsafeActed | Killed
+@dataclass(frozen=True, slots=True)
+class ResumeGivenUp:
+    """The autopilot did not follow setpoints again."""
+
+    mode: str
+    """in which it stays"""
+
+
+@dataclass(frozen=True, slots=True)
+class AutopilotRebooted:
+    """The autopilot's time since boot has begun anew."""
+
+
+@dataclass(frozen=True, slots=True)
+class OriginMoved:
+    """The autopilot's estimator has another origin."""
+
+
+@dataclass(frozen=True, slots=True)
+class RequestRefused:
+    """The autopilot refused what was asked of it."""
+
+    request: str
+    result: int
+    """the autopilot's own number of the reason"""
+
+
+@dataclass(frozen=True, slots=True)
+class RequestUnanswered:
+    """The autopilot never answered what was asked of it."""
+
+    request: str
+
+
+Event = (
+    PhaseChanged | MotionAdopted | FailsafeActed | FailsafeNoted | PeerDoubted | NoWayBack | KillCommanded | KillGivenUp
+    | Killed | ResumeGivenUp | AutopilotRebooted | OriginMoved | RequestRefused | RequestUnanswered
+)  # fmt: skip
+
+
+def sentence(event: Event) -> str:
+    """An event as logs and recordings show it to people."""
+    match event:
+        case PhaseChanged(before, after, why):
+            return f"{before.name.lower()} -> {after.name.lower()}: {why.value}"
+        case MotionAdopted(motion):
+            return f"motion {motion.revision} ({motion.shape}) by {motion.issuer or 'the operator'}"
+        case FailsafeActed():
+            return f"failsafe: {event.sentence}"
+        case FailsafeNoted(failsafe, detail):
+            return f"{failsafe.value}: {detail}"
+        case PeerDoubted(vehicle_id, failsafe, detail):
+            return f"vehicle {vehicle_id}: {failsafe.value}: {detail}"
+        case NoWayBack(reason):
+            return f"no way back to the pads: {reason}: land"
+        case KillCommanded():
+            return "killed by command: the motors are stopped"
+        case KillGivenUp():
+            return "kill given up: the autopilot has not disarmed"
+        case Killed(cause):
+            return f"killed: {cause.value}"
+        case ResumeGivenUp(mode):
+            return f"resume given up: the autopilot stays in {mode}"
+        case AutopilotRebooted():
+            return "autopilot rebooted"
+        case OriginMoved():
+            return "estimator origin moved"
+        case RequestRefused(request, result):
+            return f"autopilot refused {request} (result {result})"
+        case RequestUnanswered(request):
+            return f"autopilot never answered {request}"

@@ -12,6 +12,7 @@ from math import dist, hypot, isfinite
 from statistics import median
 
 from companion.core.counts import Counts
+from companion.core.events import PeerDoubted
 from companion.core.failsafe import FROZEN_S, SUSPECT_S, Failsafe
 from companion.core.frames import Ned
 from companion.core.health import MOVING_M_S
@@ -222,8 +223,8 @@ class PeerTable:
     limits: PeerLimits
     history: TrajectoryHistory
     rejected: Counts = field(default_factory=lambda: Counts(COUNTED))
-    notes: list[str] = field(default_factory=list)
-    """what happened, for the log; emptied by the agent"""
+    events: list[PeerDoubted] = field(default_factory=list)
+    """what happened; emptied by the agent"""
     _peers: dict[int, _Peer] = field(default_factory=dict)
     _gated: frozenset[int] = frozenset()
     _gated_until_ns: int = 0
@@ -310,7 +311,7 @@ class PeerTable:
             self.rejected[JUMPS] += 1
             if sample.time_ns >= peer.noted_until_ns:
                 peer.noted_until_ns = sample.time_ns + round(self.limits.stale_after_s * 1e9)
-                self.notes.append(f"vehicle {sample.vehicle_id}: {JUMPS}: both places are kept clear of")
+                self.events.append(PeerDoubted(sample.vehicle_id, Failsafe.PEER_LIES, "both places are kept clear of"))
             if len(peer.tracks) == TRACKS_MAX:
                 peer.tracks.remove(min(reversed(peer.tracks), key=lambda t: t.sample.time_ns - t.first_ns))
         peer.tracks.insert(0, track)
@@ -327,10 +328,11 @@ class PeerTable:
         peer.boots[boot_id] = (min(first_ns, sample.time_ns), max(last_ns, sample.time_ns))
         peer.boot_id = boot_id
         if twofold:
-            what = Failsafe.TWO_SOURCES.value
-            self.rejected[what] += 1
+            self.rejected[Failsafe.TWO_SOURCES.value] += 1
             if now.fleet_ns >= peer.twofold_until_ns:
-                self.notes.append(f"vehicle {sample.vehicle_id}: {what}: all the distance is kept to it")
+                self.events.append(
+                    PeerDoubted(sample.vehicle_id, Failsafe.TWO_SOURCES, "all the distance is kept to it")
+                )
             peer.twofold_until_ns = now.fleet_ns + round(self.limits.stale_after_s * 1e9)
 
     def _overhear(self, peer: _Peer, sample: PeerSample, now: Instant) -> bool:

@@ -7,7 +7,7 @@ from typing import Any
 from companion.core.values import Instant
 from companion.io.clock import FleetClock
 from companion.io.transport import Request
-from companion.vehicle.border import Border
+from companion.vehicle.guard import Guard
 from companion.vehicle.preflight import ClockReading
 
 STATUS_LASTS_NS = 50_000_000
@@ -19,12 +19,12 @@ class Answers:
 
     def __init__(
         self,
-        border: Border,
+        guard: Guard,
         clock: FleetClock,
         process_facts: Callable[[Instant], dict[str, Any]],
         record: Callable[[str, Instant, bytes], None],
     ) -> None:
-        self._border = border
+        self._guard = guard
         self._clock = clock
         self._process_facts = process_facts
         self._record = record
@@ -37,7 +37,7 @@ class Answers:
             case "command":
                 answer: bytes | None = self._command(request.payload, now)
             case "preflight":
-                answer = self._border.reply("preflight", lambda: self._preflight(request, now))
+                answer = self._guard.reply("preflight", lambda: self._preflight(request, now))
             case _:
                 answer = self._recent_status(now)
         if answer is not None:
@@ -45,15 +45,15 @@ class Answers:
 
     def _command(self, payload: bytes, now: Instant) -> bytes:
         self._record("input/command", now, payload)
-        answer = self._border.receive_command(payload, now)
+        answer = self._guard.receive_command(payload, now)
         self._record("output/answer", now, answer)
         self._status = None
         return answer
 
     def _preflight(self, request: Request, now: Instant) -> bytes:
-        agent = self._border.agent
+        agent = self._guard.agent
         if request.payload != b"clock":
-            return agent.account(now).model_dump_json().encode()
+            return agent.operator.preflight_report(now).model_dump_json().encode()
         received_ns = self._clock.at(request.received_monotonic_ns).fleet_ns
         answered_ns = self._clock.now().fleet_ns
         reading = ClockReading(boot_id=agent.boot_id, received_ns=received_ns, answered_ns=answered_ns)
@@ -61,13 +61,13 @@ class Answers:
 
     def _recent_status(self, now: Instant) -> bytes | None:
         if self._status is None or now.monotonic_ns - self._status_ns > STATUS_LASTS_NS:
-            self._status = self._border.reply("status", lambda: self._make_status(now))
+            self._status = self._guard.reply("status", lambda: self._make_status(now))
             self._status_ns = now.monotonic_ns
         return self._status
 
     def _make_status(self, now: Instant) -> bytes:
-        status = self._border.agent.status(now)
+        status = self._guard.agent.status(now)
         facts = self._process_facts(now)
         rejected = {**status["rejected"], **facts.pop("rejected")}
-        rejected |= {f"raised: {kind}": count for kind, count in self._border.raised.items()}
+        rejected |= {f"raised: {kind}": count for kind, count in self._guard.raised.items()}
         return json.dumps({**status, **facts, "rejected": rejected}).encode()

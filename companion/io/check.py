@@ -20,9 +20,8 @@ from companion.errors import CompanionError
 from companion.io.clock import FleetClock
 from companion.io.link import Link, open_link
 from companion.io.network import operator_link
-from companion.vehicle.autopilot.client import AutopilotClient
+from companion.vehicle.autopilot.px4 import Px4Autopilot
 from companion.vehicle.preflight import Check, own_checks, tidy
-from companion.wire.mavlink import MavlinkCodec
 
 FREE_LEAST_GB = 1.0
 """a recording takes 25 MB for half an hour; nobody deletes the old ones"""
@@ -64,18 +63,18 @@ def _autopilot(config: FleetConfig, vehicle: Vehicle, seconds: float) -> Iterato
     try:
         yield Check("link", vehicle.mavlink, "opens", True, "")
         origin = config.origin if config.fleet.frame == "global" else None
-        client = AutopilotClient(MavlinkCodec(vehicle.system_id), origin, config.limits.control_rate_hz)
+        client = Px4Autopilot(vehicle.system_id, origin, config.limits.control_rate_hz)
         clock = FleetClock()
         received = listen(link, client, clock, seconds)
         yield Check("bytes", received, "> 0", received > 0, f"nothing came on {vehicle.mavlink} in {seconds:g} s")
-        damaged = client.link.rejected["malformed"]
+        damaged = client.rejected["malformed"]
         yield Check("damaged frames", damaged, "= 0", damaged == 0, f"{damaged} frames came damaged: baud rate, cable?")
         yield from own_checks(client.facts(clock.now()), config, vehicle)
     finally:
         link.close()
 
 
-def listen(link: Link, client: AutopilotClient, clock: FleetClock, seconds: float) -> int:
+def listen(link: Link, client: Px4Autopilot, clock: FleetClock, seconds: float) -> int:
     """Hear and ask the autopilot for a while; how many bytes came."""
     received = 0
     end_ns = time.monotonic_ns() + round(seconds * 1e9)
@@ -84,11 +83,8 @@ def listen(link: Link, client: AutopilotClient, clock: FleetClock, seconds: floa
         ready, _, _ = select.select([link], [], [], max(until_ns - now_ns, 0) * 1e-9)
         for datagram, received_ns, address in link.receive() if ready else ():
             received += len(datagram)
-            if link.admits(address, received_ns):
-                heard = client.heard
-                client.receive(datagram, clock.at(received_ns))
-                if client.heard > heard:
-                    link.confirm(address, received_ns)
+            if link.admits(address, received_ns) and client.receive(datagram, clock.at(received_ns)).autopilot:
+                link.confirm(address, received_ns)
         for datagram in client.due(clock.now()):
             link.send(datagram)
     return received

@@ -2,7 +2,7 @@
 
 It waits for the autopilot's datagrams, the peers' samples, the operator's requests and the next deadline, hands them
 to the agent with their times, and sends what the agent answers. Setpoints go out right after the position that they
-follow from; what can wait (records, answers) is done after them. Every input passes the agent's `Border`, the one place
+follow from; what can wait (records, answers) is done after them. Every input passes the agent's `Guard`, the one place
 that catches what a handler raises.
 """
 
@@ -29,8 +29,9 @@ from companion.io.recorder import Recorder
 from companion.io.records import TickRecord, TrafficRecord
 from companion.io.systemd import Notifier
 from companion.io.transport import Connect, PresenceChange, ReceivedSample, Request
-from companion.vehicle.agent import Agent, Outputs
-from companion.vehicle.border import Border
+from companion.vehicle.agent import Agent
+from companion.vehicle.guard import Guard
+from companion.vehicle.outputs import Outputs
 from companion.wire.events import encode_event
 
 SAFE, STILL_FLYING, LOST = 0, 3, 4
@@ -66,9 +67,9 @@ class Companion:
     ) -> None:
         self.settings = settings
         self.agent = Agent(config, settings.vehicle_id, secrets.randbits(32))
-        self.border = Border(self.agent)
+        self.guard = Guard(self.agent)
         self.clock = FleetClock()
-        self.answers = Answers(self.border, self.clock, self._process_facts, self._record)
+        self.answers = Answers(self.guard, self.clock, self._process_facts, self._record)
         self.recorder: Recorder | None = None
         self.lateness_ns = 0
         """of the last tick"""
@@ -140,7 +141,7 @@ class Companion:
 
     def _turn(self) -> int | None:
         """Wait for whatever comes first and do what is due; the exit status when it is time to end."""
-        deadline_ns = min(self.border.next_deadline_ns(), self._second_ns)
+        deadline_ns = min(self.guard.next_deadline_ns(), self._second_ns)
         ready = self._wait_until(deadline_ns)
         if self.link in ready:
             self._receive_mavlink()
@@ -168,9 +169,10 @@ class Companion:
                 continue
             now = self._instant(received_ns)
             self._record("input/mavlink", now, datagram)
-            if self.border.receive_mavlink(datagram, now):
+            heard = self.guard.receive_mavlink(datagram, now)
+            if heard.autopilot:
                 self.link.confirm(address, received_ns)
-            if self._driver_ns is None and self.agent.next_deadline_ns() == 0:
+            if heard.position and self._driver_ns is None:
                 self._driver_ns = received_ns
 
     def _receive_from_peers(self) -> list[Request]:
@@ -181,21 +183,21 @@ class Companion:
             match event:
                 case ReceivedSample():
                     self._record("input/peer", now, event.key.encode() + b"\0" + event.payload)
-                    self.border.receive_peer(event.key, event.payload, now)
+                    self.guard.receive_peer(event.key, event.payload, now)
                 case PresenceChange():
                     self._record("input/presence", now, bytes((event.vehicle_id, event.alive)))
-                    self.border.receive_presence(event.vehicle_id, event.alive, now)
+                    self.guard.receive_presence(event.vehicle_id, event.alive, now)
                 case Request():
                     requests.append(event)
         return requests
 
     def _advance(self, deadline_ns: int) -> None:
         """The agent's tick, if it is due: setpoints first, then the peers, then the records."""
-        if self.border.next_deadline_ns() > time.monotonic_ns():
+        if self.guard.next_deadline_ns() > time.monotonic_ns():
             return
         now = self._instant(time.monotonic_ns())
         self._record("advance", now, b"")
-        out = self.border.advance(now)
+        out = self.guard.advance(now)
         for datagram in out.mavlink:
             self.link.send(datagram)
         sent_ns = time.monotonic_ns()
@@ -221,13 +223,13 @@ class Companion:
         stop_by_ns = now.monotonic_ns + round(grace_s * 1e9)
         if self._stop_by_ns is None:
             self._record("input/stop", now, b"")
-            self.border.stop(now)
+            self.guard.stop(now)
             self._stop_by_ns = stop_by_ns
             self._notifier.stopping()
         self._stop_by_ns = min(self._stop_by_ns, stop_by_ns)
 
     def _exit_status(self, now_ns: int) -> int | None:
-        if self.border.lost(now_ns):
+        if self.guard.lost(now_ns):
             return LOST
         if self._stop_by_ns is None:
             return None
@@ -253,7 +255,7 @@ class Companion:
 
     def _tell_raised(self, now_ns: int) -> None:
         """Log and record what was raised for the first time."""
-        notes, self.border.notes = self.border.notes, []
+        notes, self.guard.notes = self.guard.notes, []
         for note in notes:
             self._note(self._instant(now_ns), f"raised: {note}")
 
@@ -297,7 +299,7 @@ class Companion:
             self._noticed.add(failsafe)
             now = self._instant(now_ns)
             self._record("input/notice", now, failsafe.name.encode())
-            self.border.notice(failsafe, now)
+            self.guard.notice(failsafe, now)
 
     def _configuration(self) -> bytes | None:
         try:
@@ -315,7 +317,7 @@ class Companion:
         }
         return {
             "lateness_ms": self.lateness_ns * 1e-6,
-            "own_id_heard": self.agent.own_id_heard(now),
+            "own_id_heard": self.agent.publisher.own_id_heard(now),
             "dropped": counters.dropped,
             "recorder_lost": 0 if self.recorder is None else self.recorder.lost,
             "rejected": {kind: count for kind, count in elsewhere.items() if count},

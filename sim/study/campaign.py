@@ -14,11 +14,12 @@ import numpy as np
 
 from companion.config import FleetConfig
 from companion.config.file import parse
+from companion.core.events import FailsafeActed, PhaseChanged
 from companion.core.failsafe import Failsafe
 from companion.core.safety.filter import COLLISION_DISTANCE_M as COLLISION_M
 from companion.core.values import FLYING_PHASES, Instant, Phase
 from companion.errors import ConfigError
-from companion.vehicle.flight import ON_GROUND
+from companion.vehicle.supervisor import ON_GROUND
 from companion.wire.mavlink import Px4Mode
 from sim.autopilot.faults import Fault, FaultKind
 from sim.lockstep.lockstep import Lockstep, Vehicle
@@ -278,7 +279,7 @@ def fly(flight: Flight, seed: int, tell: Callable[[str], None] = lambda _: None)
         config, seed=seed, network=NetworkParameters(delay_s=flight.delay_s, loss=flight.loss),
         record=ear.listen if lies else None,
     )  # fmt: skip
-    ls.run_until(READY_S, lambda: not any(v.agent.unready(ls.now) for v in ls.vehicles.values()))
+    ls.run_until(READY_S, lambda: not any(v.agent.operator.unready(ls.now) for v in ls.vehicles.values()))
     answers = {i: json.loads(a) for i, a in ls.command(b'{"verb":"takeoff"}').items()}
     if len(answers) < flight.vehicles or not all(a["accepted"] for a in answers.values()):
         raise RuntimeError(f"seed {seed}: the take-off is refused before any fault: {answers}")
@@ -302,8 +303,8 @@ def fly(flight: Flight, seed: int, tell: Callable[[str], None] = lambda _: None)
         "left_in_hold": [i for i, v in ls.vehicles.items() if _orphan(v)],
         "unexplained": [(s, i, what.value) for s, i, what in failsafes if not _explained((s, i, what), faults)],
         "failsafes": [(s, i, what.value) for s, i, what in failsafes],
-        "formed": any(note.startswith("forming -> formed") for _, _, note in ls.notes),
-        "flew_the_plan": any("-> moving" in note for _, _, note in ls.notes),
+        "formed": any(isinstance(e, PhaseChanged) and e.after is Phase.FORMED for _, _, e in ls.events),
+        "flew_the_plan": any(isinstance(e, PhaseChanged) and e.after is Phase.MOVING for _, _, e in ls.events),
         "ended_after_s": ls.now_ns * 1e-9 - began_s,
     }
 
@@ -360,8 +361,8 @@ def _orphan(v: Vehicle) -> bool:
 
 def _failsafes(ls: Lockstep) -> list[tuple[float, int, Failsafe]]:
     """Every failsafe that a vehicle told of: when (s), whose, which."""
-    said = [(s, i, n.removeprefix("failsafe: ")) for s, i, n in ls.notes if n.startswith("failsafe: ")]
-    return [(s, i, Failsafe(n.split(":")[0])) for s, i, n in said]
+    since_ns = ls.now.fleet_ns - ls.now_ns
+    return [((t - since_ns) * 1e-9, i, e.failsafe) for t, i, e in ls.events if isinstance(e, FailsafeActed)]
 
 
 def _explained(told: tuple[float, int, Failsafe], faults: Sequence[Drawn]) -> bool:

@@ -37,7 +37,7 @@ IDS = itertools.count()
 
 def ordered(agent: Agent, motion: bytes) -> bytes:
     """A command to fly a motion, given at a vehicle's place."""
-    head = {"id": f"{next(IDS)}", "issuer": "x", "after": {agent.id: [agent.orders.place(agent.flight.begun)]}}
+    head = {"id": f"{next(IDS)}", "issuer": "x", "after": {agent.id: [agent.operator.place]}}
     return b'{"verb":"motion",%s,"motion":%s}' % (json.dumps(head)[1:-1].encode(), motion)
 
 
@@ -380,7 +380,7 @@ class Calls:
 
 
 def give(agent: Agent, given: Input, now: Instant) -> None:
-    """Hand an input to an agent as its process does, without the border that catches what raises."""
+    """Hand an input to an agent as its process does, without the guard that catches what raises."""
     match given.kind:
         case "plan" | "state":
             agent.receive_peer(given.key, given.payload, now)
@@ -391,7 +391,7 @@ def give(agent: Agent, given: Input, now: Instant) -> None:
         case "status":
             assert len(json.dumps(agent.status(now))) < 40_000
         case "preflight":
-            assert len(agent.account(now).model_dump_json()) < 40_000
+            assert len(agent.operator.preflight_report(now).model_dump_json()) < 40_000
 
 
 def flooded(seed: int, count: int) -> tuple[int, int, int]:
@@ -401,10 +401,10 @@ def flooded(seed: int, count: int) -> tuple[int, int, int]:
     ls = launch(config, seed=seed)
     until_formed(ls)
     inputs, given, through, most = Inputs(config, seed), 0, 0, 0
-    while given < count and any(v.agent.flight.steers for v in ls.vehicles.values()):
+    while given < count and any(v.agent.supervisor.steers for v in ls.vehicles.values()):
         ls.run_until((ls.now_ns + 20_000_000) * 1e-9)
         for i, v in ls.vehicles.items():
-            for _ in range(8 if v.agent.flight.steers else 0):
+            for _ in range(8 if v.agent.supervisor.steers else 0):
                 one = inputs.one(v.agent.history.newest, ls.now.fleet_ns)
                 if one.kind in ("plan", "state"):
                     try:

@@ -98,7 +98,7 @@ class Flown:
         self.ls = Lockstep(fleet(1, altitude_m=ALTITUDE_M, change=change), seed=3, record=self.record)
         self.agent = self.ls.vehicles[1].agent
         self.law = self.agent.law = AskedFor(self.agent.law)
-        self.ls.run_until(20.0, lambda: not self.agent.unready(self.ls.now))
+        self.ls.run_until(20.0, lambda: not self.agent.operator.unready(self.ls.now))
 
     def record(self, i: int, channel: str, now: Instant, body: bytes) -> None:
         if channel == "output/mavlink" and body[7:10] == b"\x54\x00\x00":
@@ -136,7 +136,7 @@ def test_what_is_sent_is_within_the_limit_and_nothing_is_sent_disarmed_or_withou
     flown.silent(0.9)
     assert flown.during(0.9) == [], "disarmed, positions stale"
     flown.asks(None)
-    until(flown.ls, 20.0, lambda: not flown.agent.unready(flown.ls.now))
+    until(flown.ls, 20.0, lambda: not flown.agent.operator.unready(flown.ls.now))
     flown.ls.command(b'{"verb":"takeoff"}')
     until(flown.ls, 30.0, lambda: flown.ls.all_in(Phase.WAITING))
     wait(flown.ls, 1.0)
@@ -173,7 +173,7 @@ def test_the_filter_that_flies_is_the_one_that_starts_anew_whatever_is_put_in_it
     agent, ls = flown.agent, flown.ls
     watched = agent.safety = Watched(agent.config.safety_limits, acceleration_m_s2=(5.0, -5.0))
     ls.command(b'{"verb":"takeoff"}')
-    until(ls, 20.0, lambda: agent.phase is Phase.CLIMBING and agent.flight.steers)
+    until(ls, 20.0, lambda: agent.phase is Phase.CLIMBING and agent.supervisor.steers)
     assert watched.started == 1
     assert abs(watched.acceleration_m_s2[0]) < 1.0, "what was flown before is forgotten"
     until(ls, 20.0, lambda: agent.phase is Phase.WAITING)

@@ -20,8 +20,8 @@ def test_others_keep_clear_of_a_vehicle_whose_companion_starts_anew_in_flight(
 ) -> None:
     nearest_m, i, ls = restarted(shape, seed, line)
     assert nearest_m >= CLEARANCE_M
-    assert not line or ls.vehicles[i].agent.messages_sent > 0
-    assert line or ls.vehicles[i].agent.messages_sent == 0
+    assert not line or ls.vehicles[i].agent.publisher.messages_sent > 0
+    assert line or ls.vehicles[i].agent.publisher.messages_sent == 0
     assert all(p is Phase.LANDED for j, p in ls.phases().items() if j != i)
 
 
@@ -41,7 +41,7 @@ def test_a_companion_that_knows_not_where_it_is_says_nothing_and_is_known_to_be_
     wait(ls, 1.0)
     ls.restart(2, line_dead_s=4.0)
     wait(ls, 3.5)
-    assert ls.vehicles[2].agent.messages_sent == 0
+    assert ls.vehicles[2].agent.publisher.messages_sent == 0
     assert ls.vehicles[1].agent.peers.phases()[2] is None
     wait(ls, 3.0)
     # With its line it tells where it truly is, idle and in the air, or landed by its autopilot meanwhile.

@@ -45,7 +45,7 @@ def says(armed: bool) -> Any:
 def check_one_disarm(vehicle: AgentOnLink, delay_s: float, port: int = GCS_PORT) -> None:
     """Take-off, arming, disarm after a while: it stays disarmed until it is commanded again."""
     agent = vehicle.agent
-    vehicle.run_while(lambda: bool(agent.unready(vehicle.now)), 60.0)
+    vehicle.run_while(lambda: bool(agent.operator.unready(vehicle.now)), 60.0)
     boot, begun, obeyed = agent.status(vehicle.now)["place"]
     order = {"verb": "takeoff", "id": f"{delay_s}", "issuer": "test", "after": {"1": [[boot, begun, obeyed]]}}
     answer = json.loads(agent.receive_command(json.dumps(order).encode(), vehicle.now))

@@ -22,7 +22,7 @@ from companion.core.safety.filter import ACTING
 from companion.core.trajectory import FleetTrajectory, TurnLeg, VelocityLeg, with_formation, with_legs
 from companion.core.values import Instant
 from companion.vehicle.agent import REJECTED, Agent
-from companion.vehicle.autopilot.client import COUNTED
+from companion.vehicle.autopilot.px4 import COUNTED
 from companion.wire import mavlink
 from companion.wire.peer import encode_motion
 

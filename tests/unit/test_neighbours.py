@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from companion.core.failsafe import Failsafe
 from companion.core.formation import shape_slots
 from companion.core.frames import Ned
 from companion.core.monitor import PeerMotion, unheard_error_m
@@ -783,7 +784,7 @@ def test_two_processes_under_one_id_are_a_fault_of_that_id() -> None:
     for k in range(4):
         t.accept(message(sample(t, 2, 1.0 + k), k, boot_id=(7, 8)[k % 2]), at(1.0 + k))
     assert t.rejected == {"two sources under one id": 1}
-    assert [n.split(":")[1].strip() for n in t.notes] == ["two sources under one id"]
+    assert [e.failsafe for e in t.events] == [Failsafe.TWO_SOURCES]
     (n,) = places(t, 4.0, 2)
     assert not n.in_formation
     assert not n.shares_avoidance

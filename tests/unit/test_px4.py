@@ -9,21 +9,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import development as dialect
 
+from companion.core.events import RequestRefused, RequestUnanswered
 from companion.core.frames import Geodetic, Ned, ned_to_geodetic
 from companion.core.values import Instant
-from companion.vehicle.autopilot.client import (
+from companion.vehicle.autopilot.px4 import (
     LATENCY_WINDOW_NS,
     PARAMETER_PERIOD_NS,
     PARAMETER_TRIES,
     PARAMETERS_AT_ONCE,
     RETRY_S,
     TRIES,
-    AutopilotClient,
     BootClock,
+    Px4Autopilot,
 )
 from companion.vehicle.preflight import PARAMETERS
 from companion.wire import mavlink as wire
-from companion.wire.mavlink import MavlinkCodec, Px4Mode
+from companion.wire.mavlink import Px4Mode
 
 SYSTEM_ID = 7
 FLEET = Geodetic(47.397742, 8.545594, 488.0)
@@ -38,13 +39,13 @@ def at(seconds: float) -> Instant:
 class Px4:
     """The other end of the link, by hand."""
 
-    def __init__(self, client: AutopilotClient) -> None:
+    def __init__(self, client: Px4Autopilot) -> None:
         self.client = client
         self.mav: Any = dialect.MAVLink(None, srcSystem=SYSTEM_ID, srcComponent=1)
         self.asked: list[tuple[float, Any]] = []
 
     def says(self, message: Any, seconds: float) -> bool:
-        return self.client.receive(bytes(message.pack(self.mav)), at(seconds))
+        return self.client.receive(bytes(message.pack(self.mav)), at(seconds)).position
 
     def heartbeat(self, seconds: float, armed: bool = False, mode: int = 0, kind: int = 12, type_: int = 2) -> None:
         self.says(dialect.MAVLink_heartbeat_message(type_, kind, 128 * armed | 1, int(mode), 3, 3), seconds)
@@ -86,7 +87,7 @@ class Px4:
 
 
 def px4(origin: Geodetic | None = FLEET) -> Px4:
-    return Px4(AutopilotClient(MavlinkCodec(SYSTEM_ID), origin))
+    return Px4(Px4Autopilot(SYSTEM_ID, origin))
 
 
 def ready(at_s: float = 10.0) -> Px4:
@@ -235,7 +236,7 @@ def test_a_request_that_is_never_answered_is_given_up_and_noted() -> None:
     one.client.ask("arming", *wire.arm_parameters(True))
     one.run(10.0, 10.0 + TRIES * RETRY_S + 1.0)
     assert len(one.times_of(400)) == TRIES
-    assert "autopilot never answered arming" in one.client.notes
+    assert RequestUnanswered("arming") in one.client.events
 
 
 def test_the_same_request_is_not_queued_twice() -> None:
@@ -257,7 +258,7 @@ def test_a_refusal_is_noted_and_the_request_not_repeated_at_once() -> None:
             one.answer(400, 2, now + 0.001)
     assert 3 <= len(one.times_of(400)) <= 5
     assert one.client.counts["refused: arming"] == len(one.times_of(400))
-    assert one.client.notes[0] == "autopilot refused arming (result 2)"
+    assert one.client.events[0] == RequestRefused("arming", 2)
 
 
 @pytest.mark.parametrize("result", [1, 5], ids=["temporarily rejected", "in progress"])
@@ -268,7 +269,7 @@ def test_an_answer_that_decides_nothing_leaves_the_request_open(result: int) -> 
     one.answer(400, result, 10.1)
     one.run(10.1, 11.0)
     assert one.times_of(400) == pytest.approx([10.0, 10.6])
-    assert not one.client.notes
+    assert not one.client.events
 
 
 def test_an_answer_to_nothing_asked_is_counted() -> None:
@@ -303,7 +304,7 @@ def test_what_is_withdrawn_is_not_repeated_and_its_late_answer_is_no_surprise() 
     assert one.times_of(22) == [10.0]
     assert one.client.counts["answer to nothing asked"] == 0
     assert one.client.counts["refused: take-off"] == 0
-    assert not any("take-off" in note for note in one.client.notes)
+    assert RequestUnanswered("take-off") not in one.client.events
 
 
 def test_what_is_withdrawn_before_it_was_sent_is_never_sent() -> None:

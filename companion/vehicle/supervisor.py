@@ -10,7 +10,18 @@ from math import dist, hypot
 
 from companion.config import FleetConfig
 from companion.core.counts import Counts
-from companion.core.events import Event, FailsafeActed, KillCause, Killed, PhaseChanged
+from companion.core.events import (
+    Event,
+    FailsafeActed,
+    FailsafeNoted,
+    KillCause,
+    KillCommanded,
+    Killed,
+    KillGivenUp,
+    NoWayBack,
+    PhaseChanged,
+    ResumeGivenUp,
+)
 from companion.core.failsafe import (
     BATTERY_S,
     CLIMB_S,
@@ -42,10 +53,10 @@ from companion.core.values import (
     Phase,
     VehicleState,
 )
-from companion.vehicle.autopilot.client import AutopilotClient
+from companion.vehicle.autopilot.px4 import Px4Autopilot
 from companion.vehicle.preflight import ACCURACY_LIMIT_M
 from companion.wire import mavlink as wire
-from companion.wire.mavlink import Px4Mode, mode_name
+from companion.wire.mavlink import Px4Mode
 
 SETTLED_TOLERANCE_M = 0.6
 SETTLED_FOR_NS = 1_000_000_000
@@ -97,12 +108,12 @@ class _Orders:
 
 
 @dataclass(slots=True)
-class Flight:
+class Supervisor:
     """Phase, failsafes and what is asked of the autopilot."""
 
     config: FleetConfig
     vehicle_id: int
-    autopilot: AutopilotClient
+    autopilot: Px4Autopilot
     history: TrajectoryHistory
     peers: PeerTable
     restart_filter: Callable[[], None]
@@ -110,17 +121,15 @@ class Flight:
     phase: Phase = Phase.IDLE
     failsafes: list[str] = field(default_factory=list)
     counts: Counts = field(default_factory=lambda: Counts(failsafe.value for failsafe in Failsafe))
-    notes: list[str] = field(default_factory=list)
-    """what happened, for the log; emptied by the agent"""
     events: list[Event] = field(default_factory=list)
-    """what happened, as values; emptied by the agent"""
+    """what happened; emptied by the agent"""
     killed: KillCause | None = None
     """how the motors were stopped before the vehicle had landed, since the last take-off command"""
     return_wanted: bool = False
     """a failsafe of this vehicle wants the whole fleet back over its pads"""
     forms_without: bool = False
     """the wait for the others is over, and those that are up form without them"""
-    behind: bool = False
+    outdated: bool = False
     """a peer holds a newer motion than we do"""
     formation_since_ns: int | None = None
     phase_since_ns: int = 0
@@ -182,9 +191,29 @@ class Flight:
         )
 
     @property
-    def alone(self) -> bool:
+    def detached(self) -> bool:
         """Whether it flies by itself: the formation does not draw it."""
         return self.phase is Phase.DETACHED or self._orders.resume_ns is not None
+
+    # -- what others tell ----------------------------------------------------------------------------------------------
+
+    def position_came(self) -> bool:
+        """The autopilot has told a new position; whether it is a jump."""
+        ap = self.autopilot
+        assert ap.position_ns is not None
+        return self.positions.see(ap.position_ns, ap.position_ned_m, ap.velocity_ned_m_s)
+
+    def state(self, now: Instant) -> tuple[Ned, Ned] | None:
+        """Position and velocity to steer by (fleet frame); None while there are none to trust."""
+        return None if self.positions.frozen else self.autopilot.state(now)
+
+    def heard_order(self, newer: bool) -> None:
+        """A peer has told which motion it holds: `newer` than the own newest, or not."""
+        self.outdated = newer
+
+    def return_is_over(self) -> None:
+        """The fleet flies something else after a way back: no failsafe of before wants it any more."""
+        self.return_wanted = False
 
     # -- the operator's commands: each returns why it is refused, or None ----------------------------------------------
 
@@ -224,7 +253,7 @@ class Flight:
         self.autopilot.cancel()
         self.autopilot.ask("kill", *wire.kill_parameters())
         self._orders.kill_ns, self._orders.kill_armed = now.monotonic_ns, self.autopilot.armed
-        self.notes.append("killed by command: the motors are stopped")
+        self.events.append(KillCommanded())
         return None
 
     def resume(self, now: Instant) -> str | None:
@@ -241,7 +270,7 @@ class Flight:
             return "it is on the ground"
         if self.autopilot.landed_state == LANDED_STATE_UNKNOWN:
             return "its autopilot does not tell whether it is in the air"
-        if self.autopilot.state(now) is None or self.positions.frozen:
+        if self.state(now) is None:
             return "no position"
         self._orders.release_ns = None
         self._orders.resume_ns = now.monotonic_ns
@@ -270,8 +299,7 @@ class Flight:
         if after is before:
             return
         ap = self.autopilot
-        self.notes.append(f"{before.name.lower()} -> {after.name.lower()}: {event.value}")
-        self.events.append(PhaseChanged(before, after))
+        self.events.append(PhaseChanged(before, after, event))
         if event is PhaseEvent.DISARMED:
             self._disarmed_ns = now.monotonic_ns
         elif event is PhaseEvent.TAKE_OFF:
@@ -303,10 +331,9 @@ class Flight:
     def _fail(self, what: Failsafe, now: Instant, detail: str = "", action: Action | None = None) -> None:
         """Do what the table says, or what the configuration has chosen among the row's ways."""
         chosen = FAILSAFES[what].action if action is None else action
-        sentence = f"{what.value}: {detail}: {chosen.value}" if detail else f"{what.value}: {chosen.value}"
-        self.failsafes.append(sentence)
-        self.notes.append(f"failsafe: {sentence}")
-        self.events.append(FailsafeActed(what, sentence))
+        acted = FailsafeActed(what, chosen, detail)
+        self.failsafes.append(acted.sentence)
+        self.events.append(acted)
         match chosen:
             case Action.LAND:
                 self._happened(PhaseEvent.LAND, now)
@@ -316,6 +343,11 @@ class Flight:
                 self._stand(now, LISTEN_S)
             case Action.RETURN:
                 self.return_wanted = True
+
+    def _note(self, what: Failsafe, detail: str) -> None:
+        """Say and count what calls for no action."""
+        self.counts[what.value] += 1
+        self.events.append(FailsafeNoted(what, detail))
 
     def _stand(self, now: Instant, listen_s: float) -> None:
         """Stand by itself where the vehicle is; it comes back after listening so long."""
@@ -327,7 +359,7 @@ class Flight:
     def _taken_over(self, now: Instant) -> None:
         ap = self.autopilot
         by_itself = ap.intended_mode is not None and ap.intended_mode != ap.custom_mode
-        self._fail(Failsafe.AUTOPILOT if by_itself else Failsafe.PILOT, now, mode_name(ap.custom_mode))
+        self._fail(Failsafe.AUTOPILOT if by_itself else Failsafe.PILOT, now, ap.mode_name)
 
     # -- at each control tick ------------------------------------------------------------------------------------------
 
@@ -371,7 +403,6 @@ class Flight:
     def _note_killed(self, cause: KillCause) -> None:
         if self.killed is None:
             self.killed = cause
-            self.notes.append(f"killed: {cause.value}")
             self.events.append(Killed(cause))
 
     def _watch_orders(self, now: Instant) -> None:
@@ -386,7 +417,7 @@ class Flight:
                 ap.withdraw("kill")
                 orders.kill_ns = None
                 if ap.armed:
-                    self.notes.append("kill given up: the autopilot has not disarmed")
+                    self.events.append(KillGivenUp())
             else:
                 ap.ask("kill", *wire.kill_parameters())
         if orders.release_ns is not None:
@@ -403,7 +434,7 @@ class Flight:
             waited_ns = now.monotonic_ns - orders.resume_ns
             if not ap.armed or waited_ns > RESUME_LIMIT_NS:
                 self._end_resume(now)
-                self.notes.append(f"resume given up: the autopilot stays in {mode_name(ap.custom_mode)}")
+                self.events.append(ResumeGivenUp(ap.mode_name))
             elif ap.custom_mode == Px4Mode.OFFBOARD:
                 orders.resume_ns = None
                 self._happened(PhaseEvent.RESUMED, now)
@@ -522,8 +553,7 @@ class Flight:
             # No failsafe of ours: positions may come again before the autopilot's own acts, and if it acts, it leaves
             # OFFBOARD, which is one.
             what = Failsafe.POSITION_FROZEN if self.positions.frozen else Failsafe.POSITION_STALE
-            self.counts[what.value] += 1
-            self.notes.append(f"{what.value}: no setpoints")
+            self._note(what, "no setpoints")
             self._unpositioned_since_ns = now.monotonic_ns
         self._unpositioned = not positioned
         if not positioned:
@@ -582,16 +612,14 @@ class Flight:
 
     def no_way_back(self, reason: str, now: Instant) -> None:
         """The fleet's way back to the pads cannot be flown: land where the vehicle is."""
-        self.notes.append(f"no way back to the pads: {reason}: land")
+        self.events.append(NoWayBack(reason))
         self._happened(PhaseEvent.LAND, now)
 
     def _watch_battery_status(self, now: Instant) -> None:
         """Note in flight that the battery is told no more; landing for it is left to the autopilot."""
         known = self.autopilot.battery(now) >= 0
         if self._battery_known and not known and self.phase in FLYING_PHASES:
-            what = Failsafe.BATTERY_UNKNOWN
-            self.counts[what.value] += 1
-            self.notes.append(f"{what.value}: last told {self.autopilot.battery_percent} %")
+            self._note(Failsafe.BATTERY_UNKNOWN, f"last told {self.autopilot.battery_percent} %")
         self._battery_known = known
 
     def _watch_peers(self, now: Instant) -> bool:
@@ -672,7 +700,7 @@ class Flight:
     def _come_back(self, slot: Reference, jumps: bool, now: Instant) -> None:
         own = self._own
         if own.start_ns is None:
-            if now.monotonic_ns >= self._listens_until_ns and not self.behind and self._hears_somebody(now):
+            if now.monotonic_ns >= self._listens_until_ns and not self.outdated and self._hears_somebody(now):
                 here = own.reference(slot, now.fleet_ns)
                 own.come_back(slot, here, now.fleet_ns, self._speed_m_s)
         elif jumps and self._reference is not None:

@@ -5,16 +5,17 @@ another; GPS_GLOBAL_ORIGIN comes once after boot and must be requested; LOCAL_PO
 what a command has done shows in the next HEARTBEAT, which comes once a second.
 """
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import dist, inf
 from typing import NamedTuple
 
 from companion.core.counts import Counts
+from companion.core.events import AutopilotRebooted, Event, OriginMoved, RequestRefused, RequestUnanswered
 from companion.core.failsafe import DAMAGE_M, STATUS_S
 from companion.core.frames import Geodetic, LocalFrame, Ned
-from companion.core.values import ZERO, Instant
+from companion.core.values import ZERO, Instant, SafeSetpoint
 from companion.vehicle.preflight import (
     ESTIMATOR_FLAGS_NEEDED,
     ESTIMATOR_GLOBAL_FLAG,
@@ -26,7 +27,7 @@ from companion.vehicle.preflight import (
     same_setting,
 )
 from companion.wire import mavlink as wire
-from companion.wire.mavlink import MavlinkCodec, Px4Mode
+from companion.wire.mavlink import MavlinkCodec, Px4Mode, mode_name
 
 RETRY_S = 0.5
 TRIES = 8
@@ -169,19 +170,29 @@ class ParameterReader:
         return min((next_ns for _, next_ns in waiting), default=self._round_ns)
 
 
-class AutopilotClient:
+class Heard(NamedTuple):
+    """What one datagram brought."""
+
+    autopilot: bool
+    """a heartbeat or a position: what proves that it is our autopilot that speaks"""
+    position: bool
+    """a position newer than the one before"""
+
+
+NOTHING = Heard(autopilot=False, position=False)
+
+
+class Px4Autopilot:
     """One autopilot as seen over its link."""
 
     def __init__(
-        self, link: MavlinkCodec, fleet_origin: Geodetic | None, position_rate_hz: float = wire.POSITION_RATE_HZ
+        self, system_id: int, fleet_origin: Geodetic | None, position_rate_hz: float = wire.POSITION_RATE_HZ
     ) -> None:
-        self.link = link
+        self.link = MavlinkCodec(system_id)
         self.position_rate_hz = position_rate_hz
         self.counts = Counts(COUNTED)
-        self.heard = 0
-        """heartbeats and positions so far: what proves that it is our autopilot that speaks"""
-        self.notes: list[str] = []
-        """what happened, for the log; emptied by the agent"""
+        self.events: list[Event] = []
+        """what happened; emptied by the agent"""
         self.fleet_origin = fleet_origin
         self.armed = False
         self.custom_mode = 0
@@ -231,21 +242,21 @@ class AutopilotClient:
         self._clock_ahead_ns: deque[int] = deque(maxlen=CLOCK_SAMPLES)
         self._origin_doubted = False
 
-    def receive(self, datagram: bytes, now: Instant) -> bool:
-        """Take a datagram; True if it brought a position."""
+    def receive(self, datagram: bytes, now: Instant) -> Heard:
+        """Take a datagram; returns what it brought."""
         self._now_ns = now.monotonic_ns
-        fresh = False
+        ours = fresh = False
         foreign = self.link.foreign_heard
-        events = self.link.decode(datagram)
+        messages = self.link.decode(datagram)
         if self.link.foreign_heard > foreign:
             self.foreign_ns = now.monotonic_ns
-        for event in events:
+        for event in messages:
             match event:
                 case wire.LocalPosition():
-                    self.heard += 1
+                    ours = True
                     fresh = self._position(event, now) or fresh
                 case wire.Heartbeat():
-                    self.heard += 1
+                    ours = True
                     self._heartbeat(event, now)
                 case wire.CurrentMode():
                     self.custom_mode = event.custom_mode
@@ -272,7 +283,7 @@ class AutopilotClient:
                     self._clock_ahead_ns.append(event.unix_us * 1000 - now.fleet_ns)
                 case wire.CommandAnswer():
                     self._answer(event, now)
-        return fresh
+        return Heard(ours, fresh)
 
     def _heartbeat(self, event: wire.Heartbeat, now: Instant) -> None:
         first = self.heartbeat_ns is None
@@ -308,7 +319,7 @@ class AutopilotClient:
     def _position(self, event: wire.LocalPosition, now: Instant) -> bool:
         boot_ms = self._unwrapped(event.boot_ms, now)
         if boot_ms < self.boot.last_boot_ms - 1000:
-            self.notes.append("autopilot rebooted")
+            self.events.append(AutopilotRebooted())
             self.counts["autopilot reboot"] += 1
             self.boot.restart()
             boot_ms = event.boot_ms
@@ -343,7 +354,7 @@ class AutopilotClient:
             return
         before, self.frame = self.frame, LocalFrame.from_origins(origin, self.fleet_origin)
         if self.origin is not None and before is not None:
-            self.notes.append("estimator origin moved")
+            self.events.append(OriginMoved())
             self.counts["estimator origin moved"] += 1
             was, is_, crept = before.to_fleet(ZERO), self.frame.to_fleet(ZERO), self.origin_crept_ned_m
             if dist(was, is_) < DAMAGE_M:
@@ -384,7 +395,7 @@ class AutopilotClient:
             self._refused[request.name] = now.monotonic_ns + round(RETRY_S * 1e9)
             self.counts[f"refused: {request.name.split()[0]}"] += 1
             if not request.name.startswith("stream"):
-                self.notes.append(f"autopilot refused {request.name} (result {event.result})")
+                self.events.append(RequestRefused(request.name, event.result))
 
     def ask(self, name: str, command: int, *parameters: float, once: bool = False) -> None:
         """Ask for a command, retried until answered.
@@ -454,7 +465,7 @@ class AutopilotClient:
                     if request.once:
                         self._outcomes[request.name] = Outcome(now.monotonic_ns, accepted=False)
                     self.counts["unanswered"] += 1
-                    self.notes.append(f"autopilot never answered {request.name}")
+                    self.events.append(RequestUnanswered(request.name))
             if queue and now.monotonic_ns >= queue[0].next_ns:
                 queue[0].tries += 1
                 queue[0].next_ns = now.monotonic_ns + round((ANSWER_S if queue[0].once else RETRY_S) * 1e9)
@@ -481,6 +492,28 @@ class AutopilotClient:
         if self.heartbeat_ns is not None and not self.armed:
             times += [self._round_trip_asked_ns + ROUND_TRIP_PERIOD_NS, self.parameters.next_deadline_ns()]
         return min(times)
+
+    def setpoint(self, setpoint: SafeSetpoint) -> bytes:
+        """The datagram that has the autopilot fly a setpoint; once `state` has told one, the frame is known."""
+        assert self.frame is not None
+        s = setpoint
+        return self.link.setpoint(
+            self.boot.last_boot_ms,
+            self.frame.to_local(Ned(0.0, 0.0, s.position_down_m)).down,
+            Ned(s.velocity_north_m_s, s.velocity_east_m_s, s.velocity_down_m_s),
+            (s.acceleration_north_m_s2, s.acceleration_east_m_s2),
+            s.yaw_rad,
+        )
+
+    @property
+    def mode_name(self) -> str:
+        """The flight mode, for people."""
+        return mode_name(self.custom_mode)
+
+    @property
+    def rejected(self) -> Counter[str]:
+        """What was refused and went wrong on the link, by name."""
+        return self.link.rejected + self.counts
 
     @property
     def _asks_origin(self) -> bool:
