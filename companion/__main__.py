@@ -41,7 +41,8 @@ def run(
     had not confirmed landing, 4 could do nothing any more (a fault of ours; the autopilot's failsafe has the vehicle).
     """
     from companion.config import load
-    from companion.io.loop import Companion, RunSettings
+    from companion.io.loop import RunSettings
+    from companion.io.process import run_companion
 
     def log(text: str) -> None:
         # Not through a buffer, which on a full disk would fail again at the end and change the exit status.
@@ -51,12 +52,8 @@ def run(
 
     config = load(fleet)
     settings = RunSettings(vehicle, record, sys.stdin.fileno() if launched else None, log, fleet)
-    companion = Companion(config, settings, {"config": fleet.read_text(), "version": version("starling-fleet")})
-    try:
-        status = companion.run()
-    finally:
-        companion.close()
-    raise typer.Exit(status)
+    metadata = {"config": fleet.read_text(), "version": version("starling-fleet")}
+    raise typer.Exit(run_companion(config, settings, metadata))
 
 
 @app.command()

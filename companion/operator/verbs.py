@@ -43,12 +43,11 @@ def mount(app: typer.Typer) -> None:
 def connected(fleet: Path, vehicles: int | None, *, both: bool = False) -> "Iterator[Operator]":
     """An operator whose network is open."""
     from companion.config.overrides import fleet_config
-    from companion.io.loop import network_settings
-    from companion.io.zenoh_peers import OperatorLink
+    from companion.io.network import operator_link
     from companion.operator.client import Operator
 
     config = fleet_config(fleet, vehicles)
-    with OperatorLink(network_settings(config, None)) as link:
+    with operator_link(config) as link:
         operator = Operator(config, link, both=both)
         link.wait_alive(operator.ids, FOUND_WITHIN_S)
         yield operator

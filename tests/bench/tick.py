@@ -51,7 +51,7 @@ def tables() -> dict[str, Any]:
 
 def flight() -> list[tuple[str, int, int, bytes]]:
     """What one vehicle met: (channel, monotonic ns, fleet ns, body)."""
-    from companion.config import parse
+    from companion.config.file import parse
     from sim.lockstep.lockstep import Lockstep
 
     met: list[tuple[str, int, int, bytes]] = []
@@ -70,7 +70,7 @@ def flight() -> list[tuple[str, int, int, bytes]]:
 
 def meet(tape: Path) -> Met:
     """The recorded flight, met by the agent that this process imports."""
-    from companion.config import parse
+    from companion.config.file import parse
     from companion.core.values import FORMATION_PHASES, Instant
     from companion.vehicle.agent import Agent
 

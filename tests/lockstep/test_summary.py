@@ -22,7 +22,8 @@ from companion.core.values import Phase
 from companion.wire.mavlink import Px4Mode
 from companion.wire.peer import encode_motion
 from sim.autopilot.faults import Fault, FaultKind
-from sim.launch.summary import Flight, summarise
+from sim.launch.summary.flight import Flight
+from sim.launch.summary.summarise import summarise
 from sim.lockstep.lockstep import UTC_AT_START_NS, Lockstep
 
 ON_GROUND = 1

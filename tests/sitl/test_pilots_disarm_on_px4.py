@@ -12,7 +12,7 @@ from px4_fleet import GCS_PORT, GROUND_STATION
 from companion.config import FleetConfig, load
 from companion.core.values import Phase
 from companion.wire.mavlink import FORCE, dialect
-from sim.launch.sitl import FLEET_PARAMETERS, Px4Instance
+from sim.launch.px4_instance import FLEET_PARAMETERS, Px4Instance
 
 DELAYS_S = (0.1, 0.3, 0.6, 0.9, 1.2, 1.6, 2.0)
 ARM = dialect.MAV_CMD_COMPONENT_ARM_DISARM
