@@ -15,7 +15,7 @@ from companion.core.formation import SHAPES, Slots, centred, minimum_distance, r
 from companion.core.frames import Geodetic, Ned
 from companion.core.law.starling import Gains, paper_gains
 from companion.core.monitor import PeerMotion
-from companion.core.neighbours import PeerLimits
+from companion.core.neighbours.sample import PeerLimits
 from companion.core.safety.fence import Fence
 from companion.core.safety.filter import DOWNWASH_RATIO, SafetyLimits, safety_radius_m
 from companion.core.trajectory.fleet import PADS, FleetTrajectory, top_speed_m_s

@@ -17,7 +17,7 @@ from companion.core.events import FailsafeNoted
 from companion.core.failsafe import LATE_S, Failsafe
 from companion.core.frames import Ned
 from companion.core.law.starling import Law, StarlingLaw
-from companion.core.neighbours import PeerTable
+from companion.core.neighbours.table import PeerTable
 from companion.core.safety.filter import SafetyFilter
 from companion.core.trajectory.fleet import Reference, TrajectoryState
 from companion.core.trajectory.history import TrajectoryHistory
@@ -34,7 +34,8 @@ from companion.core.values import (
 )
 from companion.errors import WireError
 from companion.vehicle import operator_port, plan_exchange
-from companion.vehicle.autopilot.px4 import Heard, Px4Autopilot
+from companion.vehicle.autopilot.port import AutopilotPort, Heard
+from companion.vehicle.autopilot.px4 import Px4Autopilot
 from companion.vehicle.observer import StateObserver
 from companion.vehicle.operator_port import Activity, OperatorPort
 from companion.vehicle.orders import OrderBook
@@ -71,15 +72,14 @@ class Agent:
         self.rejected = Counts(REJECTED)
         others = frozenset(v.id for v in config.vehicles) - {vehicle_id}
         random = Random(vehicle_id << 32 | boot_id)
-        origin = config.origin if config.fleet.frame == "global" else None
-        self.autopilot = Px4Autopilot(self.vehicle.system_id, origin, config.limits.control_rate_hz)
+        self.autopilot: AutopilotPort = Px4Autopilot(config, self.vehicle)
         self.history = TrajectoryHistory([config.first_motion])
         self.peers = PeerTable(vehicle_id, others, config.peer_limits, self.history)
         self.law: Law = StarlingLaw(config.gains)
         """what is flown, before the filter; tests and studies may put another in its place"""
         self.safety = SafetyFilter(config.safety_limits)
         self.observer = StateObserver()
-        self.supervisor = Supervisor(config, vehicle_id, self.autopilot, self.history, self.peers, self._restart_filter)
+        self.supervisor = Supervisor(config, self.autopilot, self.history, self.peers, self._restart_filter)
         self.publisher = Publisher(config, vehicle_id, boot_id, self.history, self.peers, random)
         self.plans = PlanExchange(
             config, vehicle_id, self.history, self.peers, self.supervisor, self.publisher, random, self.rejected

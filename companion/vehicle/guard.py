@@ -20,7 +20,7 @@ from typing import TypeVar
 from companion.core.failsafe import Failsafe
 from companion.core.values import Instant
 from companion.vehicle.agent import Agent
-from companion.vehicle.autopilot.px4 import NOTHING, Heard
+from companion.vehicle.autopilot.port import NOTHING, Heard
 from companion.vehicle.outputs import Outputs
 from companion.wire.operator import Answer, encode
 

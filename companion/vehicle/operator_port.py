@@ -6,11 +6,11 @@ from typing import NamedTuple
 from companion.config import FleetConfig
 from companion.core.counts import Counts, Refusal
 from companion.core.frames import Ned, geodetic_to_ned
-from companion.core.neighbours import PeerTable
+from companion.core.neighbours.table import PeerTable
 from companion.core.trajectory.history import TrajectoryHistory
 from companion.core.values import FLYING_PHASES, Instant, Phase
 from companion.errors import WireError
-from companion.vehicle.autopilot.px4 import Px4Autopilot
+from companion.vehicle.autopilot.port import AutopilotPort
 from companion.vehicle.orders import ORDER_FAULTS, OrderBook
 from companion.vehicle.outputs import TickReport
 from companion.vehicle.plan_exchange import PlanExchange
@@ -55,7 +55,7 @@ class OperatorPort:
     config: FleetConfig
     vehicle_id: int
     boot_id: int
-    autopilot: Px4Autopilot
+    autopilot: AutopilotPort
     supervisor: Supervisor
     history: TrajectoryHistory
     peers: PeerTable

@@ -13,7 +13,7 @@ from companion.config import FleetConfig
 from companion.core.budget import Bucket, ExaminationBudget
 from companion.core.counts import Counts, RefusalKind
 from companion.core.events import Event, MotionAdopted
-from companion.core.neighbours import PeerTable
+from companion.core.neighbours.table import PeerTable
 from companion.core.trajectory.fleet import PADS, FleetTrajectory, motion_order
 from companion.core.trajectory.history import TrajectoryHistory
 from companion.core.trajectory.successors import assignment_matches, over_the_pads, with_legs

@@ -25,8 +25,7 @@ from pymavlink.dialects.v20 import development as dialect
 from companion.core.failsafe import FAILSAFES, LATE_S, STATUS_S, UNCERTAIN_S, Action, Failsafe
 from companion.core.frames import Ned
 from companion.core.values import Instant, PeerMessage, Phase
-from companion.vehicle.autopilot.px4 import Px4Autopilot
-from companion.vehicle.supervisor import ON_GROUND
+from companion.vehicle.autopilot.px4 import ON_GROUND, Px4Autopilot
 from companion.wire.mavlink import Px4Mode, mode_parameters
 from companion.wire.peer import encode_state
 from sim.autopilot.faults import Fault, FaultKind
@@ -615,7 +614,7 @@ def test_a_position_that_jumps_on_the_ground_is_no_failsafe_in_the_air(when: str
     s.tamper(49)
     s.inject(FaultKind.ESTIMATOR_RESET)
     wait(ls, 0.5)
-    assert s.ls.vehicles[1].agent.supervisor.positions.jumps == 1
+    assert s.ls.vehicles[1].agent.supervisor.flight.positions.jumps == 1
     s.tamper()
     if when == "disarmed":
         wait(ls, 2.0)

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from fleet_process import make_fleet, operator_of, run, started, wait_status
 
-from companion.vehicle.preflight import PARAMETERS
+from companion.vehicle.autopilot.px4_parameters import PARAMETERS
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(400)]
 
