@@ -11,6 +11,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from companion.core.counts import OTHER
 from companion.core.frames import Ned
 from companion.core.safety.filter import (
     COLLISION_DISTANCE_M,
@@ -58,6 +59,7 @@ def peer(
 def applied(f: SafetyFilter, c: Command, ego: VehicleState, neighbours: Sequence[Neighbour] = ()) -> SafeSetpoint:
     setpoint = f.apply(c, ego, neighbours, ZERO, DT_S)
     assert setpoint is not None
+    assert OTHER not in f.counts, "whatever acts has a name of its own"
     return setpoint
 
 
@@ -458,6 +460,7 @@ def test_whatever_comes_in_a_setpoint_is_finite_or_none(
         if s is not None:
             assert all(isfinite(x) for x in s)
             assert hypot(*acceleration(s)) <= LIMITS.avoidance_acceleration_m_s2 * (1 + 1e-9)
+    assert OTHER not in f.counts
     ordinary = f.apply(command(), state(), [], ZERO, DT_S)
     assert ordinary is not None
     assert isfinite(ordinary.velocity_north_m_s)
