@@ -6,6 +6,7 @@ follow from; what can wait (records, answers) is done after them. Every input pa
 that catches what a handler raises.
 """
 
+import json
 import os
 import secrets
 import select
@@ -106,6 +107,8 @@ class Companion:
 
     def _open_recorder(self, path: Path, metadata: dict[str, str]) -> Recorder:
         facts = {**metadata, "vehicle_id": str(self.agent.id), "boot_id": str(self.agent.boot_id)}
+        if self.agent.config.foreign:
+            facts["foreign"] = json.dumps([o._asdict() for o in self.agent.config.foreign])
         try:
             return Recorder(path, facts)
         except OSError as error:
