@@ -36,7 +36,6 @@ from companion.wire import mavlink as wire
 from companion.wire.mavlink import MavlinkCodec, Px4Mode, mode_name
 
 CLOCK_SAMPLES = 5
-RATE_WINDOW_NS = 2_000_000_000
 ON_GROUND = 1
 """EXTENDED_SYS_STATE's landed state; 0 is unknown"""
 FLAGS_NEEDED = 1 | 2 | 4
@@ -109,8 +108,6 @@ class Px4Autopilot:
         self._next_heartbeat_ns = 0
         self._next_origin_ns = 0
         self._origin_doubted = False
-        self._arrivals_ns: deque[int] = deque(maxlen=512)
-        """of the latest positions"""
         self._round_trips = RoundTrips()
         self._clock_ahead_ns: deque[int] = deque(maxlen=CLOCK_SAMPLES)
 
@@ -177,8 +174,7 @@ class Px4Autopilot:
             self.requests.ask(f"{STREAM} {message_id}", *wire.interval_parameters(message_id, rate_hz))
 
     def _position(self, message: wire.LocalPosition, now: Instant) -> bool:
-        passed_ns = now.monotonic_ns - self._arrivals_ns[-1] if self._arrivals_ns else 0
-        boot_ms = self.boot.unwrapped(message.boot_ms, passed_ns)
+        boot_ms = self.boot.unwrapped(message.boot_ms, now.monotonic_ns)
         if self.boot.rebooted(boot_ms):
             self._rebooted()
             boot_ms = message.boot_ms
@@ -186,7 +182,6 @@ class Px4Autopilot:
             self.counts["position repeated"] += 1
             return False
         made_ns = self.boot.arrived(boot_ms, now.monotonic_ns)
-        self._arrivals_ns.append(now.monotonic_ns)
         if self.frame is None:
             return False
         self.position_ns = made_ns
@@ -372,11 +367,6 @@ class Px4Autopilot:
         p, v = self.position_ned_m, self.velocity_ned_m_s
         return Ned(p.north + v.north * age_s, p.east + v.east * age_s, p.down + v.down * age_s), v
 
-    def positions_heard_hz(self, now: Instant) -> float:
-        """Positions a second over the last two."""
-        since_ns = now.monotonic_ns - RATE_WINDOW_NS
-        return sum(t > since_ns for t in self._arrivals_ns) / (RATE_WINDOW_NS * 1e-9)
-
     def facts(self, now: Instant) -> AutopilotFacts:
         """What preflight judges."""
         is_px4 = self.kind == wire.AUTOPILOT_PX4
@@ -392,7 +382,7 @@ class Px4Autopilot:
             home_altitude_amsl_m=self.home_altitude_amsl_m,
             position_ned_m=None if self.frame is None or self.position_ns is None else self.position_ned_m,
             position_age_s=self.position_age_s(now),
-            position_rate_hz=self.positions_heard_hz(now),
+            position_rate_hz=self.boot.heard_hz(now.monotonic_ns),
             battery_percent=self.battery(now),
             round_trip_s=self._round_trips.median_s(now.monotonic_ns, asking=not self.armed),
             # The least delayed of the last messages is nearest to the truth: delay makes the autopilot seem behind.
