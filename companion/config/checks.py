@@ -8,7 +8,7 @@ from companion.config.endpoints import companion_port, is_zenoh_endpoint, serial
 from companion.config.schema import FenceTable, GotoLegTable, TurnLegTable, VelocityLegTable
 from companion.core.formation import minimum_distance
 from companion.core.safety.fence import Fence
-from companion.core.trajectory import with_legs
+from companion.core.trajectory.successors import with_legs
 from companion.core.trajectory_check import PLAN_SPEED_SHARE, TURN_RATE_MIN_DEG_S, Fault, examine
 from companion.errors import ConfigError
 

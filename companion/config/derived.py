@@ -17,19 +17,11 @@ from companion.core.monitor import PeerMotion
 from companion.core.neighbours import PeerLimits
 from companion.core.safety.fence import Fence
 from companion.core.safety.filter import DOWNWASH_RATIO, SafetyLimits, safety_radius_m
-from companion.core.trajectory import (
-    PADS,
-    FleetTrajectory,
-    Leg,
-    SlotChange,
-    TurnLeg,
-    VelocityLeg,
-    goto_leg,
-    leg_end,
-    top_speed_m_s,
-    with_formation,
-    with_return,
-)
+from companion.core.trajectory.fleet import PADS, FleetTrajectory, top_speed_m_s
+from companion.core.trajectory.goto import goto_leg
+from companion.core.trajectory.legs import Leg, TurnLeg, VelocityLeg, leg_end
+from companion.core.trajectory.slots import SlotChange
+from companion.core.trajectory.successors import with_formation, with_return
 from companion.core.trajectory_check import ALTITUDE_MIN_M, PLAN_SPEED_SHARE, MotionLimits
 from companion.core.trigger import ErrorTrigger, PeriodicTrigger, Spacing, SwitchingTrigger, Trigger
 from companion.core.values import ZERO

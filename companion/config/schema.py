@@ -6,7 +6,7 @@ from pydantic import Field
 
 from companion.config.law_tables import LawTable, TriggerTable
 from companion.config.numbers import Noise, NotNegative, Percent, Positive, Real, Table, VehicleId, Wait
-from companion.core.trajectory import Then
+from companion.core.trajectory.fleet import Then
 from companion.core.trajectory_check import (
     DURATION_MAX_S,
     LEGS_MAX,

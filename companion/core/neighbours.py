@@ -20,7 +20,8 @@ from companion.core.monitor import PeerMotion
 from companion.core.near import near_bound_m
 from companion.core.prediction import HoldKind, axis, weights
 from companion.core.safety.filter import DOWNWASH_RATIO
-from companion.core.trajectory import Reference, TrajectoryHistory, TrajectoryState
+from companion.core.trajectory.fleet import Reference, TrajectoryState
+from companion.core.trajectory.history import TrajectoryHistory
 from companion.core.values import (
     AIRBORNE_PHASES,
     FILTERED_PHASES,

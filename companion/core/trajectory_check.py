@@ -14,20 +14,18 @@ from typing import NamedTuple
 from companion.core.counts import RefusalKind
 from companion.core.route import Breach, examined, only_stops, slots_apart_m, slots_continue
 from companion.core.safety.fence import Fence
-from companion.core.trajectory import (
-    BLEND_MIN_S,
-    GOTO_ACCELERATION_M_S2,
+from companion.core.trajectory.fleet import FleetTrajectory
+from companion.core.trajectory.goto import GOTO_ACCELERATION_M_S2, GotoPeaks, goto_peaks
+from companion.core.trajectory.legs import (
     TURN_RAMP_S,
-    FleetTrajectory,
     GotoLeg,
-    GotoPeaks,
     TurnLeg,
     VelocityLeg,
-    goto_peaks,
     leg_duration_s,
     turn_rate_and_time,
     velocity_ramp_s,
 )
+from companion.core.trajectory.slots import BLEND_MIN_S
 
 # -- bounds on single values ---------------------------------------------------------------------------------------
 

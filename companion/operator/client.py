@@ -20,7 +20,9 @@ from companion.config import FleetConfig
 from companion.config.schema import GotoLegTable
 from companion.core.frames import Ned
 from companion.core.route import only_stops
-from companion.core.trajectory import FleetTrajectory, Leg, TurnLeg, VelocityLeg, with_legs
+from companion.core.trajectory.fleet import FleetTrajectory
+from companion.core.trajectory.legs import Leg, TurnLeg, VelocityLeg
+from companion.core.trajectory.successors import with_legs
 from companion.core.trajectory_check import examine
 from companion.core.values import ZERO
 from companion.errors import RefusedError, WireError

@@ -15,7 +15,8 @@ from companion.config import FleetConfig
 from companion.core.formation import minimum_distance
 from companion.core.frames import Ned
 from companion.core.safety.filter import DOWNWASH_RATIO
-from companion.core.trajectory import FleetTrajectory, top_speed_m_s, with_legs
+from companion.core.trajectory.fleet import FleetTrajectory, top_speed_m_s
+from companion.core.trajectory.successors import with_legs
 from companion.core.trajectory_check import ALTITUDE_MIN_M, PLAN_SPEED_SHARE, SPEED_SLACK
 from companion.core.values import ZERO
 from companion.vehicle.preflight import Check, PreflightReport, as_json, assignment_hash, first_formation, tidy, unmet

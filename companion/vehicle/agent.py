@@ -20,7 +20,8 @@ from companion.core.frames import Ned
 from companion.core.law.starling import Law, StarlingLaw
 from companion.core.neighbours import PeerTable
 from companion.core.safety.filter import SafetyFilter
-from companion.core.trajectory import Reference, TrajectoryHistory, TrajectoryState
+from companion.core.trajectory.fleet import Reference, TrajectoryState
+from companion.core.trajectory.history import TrajectoryHistory
 from companion.core.values import (
     FILTERED_PHASES,
     SETTLED_PHASES,

@@ -8,7 +8,7 @@ from companion.config import FleetConfig
 from companion.core.counts import Counts, Refusal
 from companion.core.frames import Ned, geodetic_to_ned
 from companion.core.neighbours import PeerTable
-from companion.core.trajectory import TrajectoryHistory
+from companion.core.trajectory.history import TrajectoryHistory
 from companion.core.values import FLYING_PHASES, Instant, Phase
 from companion.vehicle.autopilot.px4 import Px4Autopilot
 from companion.vehicle.orders import ORDER_FAULTS, Order, OrderBook, Place, read_order

@@ -15,15 +15,9 @@ from companion.core.budget import Bucket, ExaminationBudget
 from companion.core.counts import Counts, RefusalKind
 from companion.core.events import Event, MotionAdopted
 from companion.core.neighbours import PeerTable
-from companion.core.trajectory import (
-    PADS,
-    FleetTrajectory,
-    TrajectoryHistory,
-    assignment_matches,
-    motion_order,
-    over_the_pads,
-    with_legs,
-)
+from companion.core.trajectory.fleet import PADS, FleetTrajectory, motion_order
+from companion.core.trajectory.history import TrajectoryHistory
+from companion.core.trajectory.successors import assignment_matches, over_the_pads, with_legs
 from companion.core.trajectory_check import Fault, examine
 from companion.core.values import FILTERED_PHASES, SETTLED_PHASES, Instant, PeerMessage, Phase
 from companion.errors import ConfigError, WireError

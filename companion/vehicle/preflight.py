@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from companion.config import FleetConfig
 from companion.config.derived import Vehicle
 from companion.core.frames import Geodetic, Ned, geodetic_to_ned
-from companion.core.trajectory import FleetTrajectory
+from companion.core.trajectory.fleet import FleetTrajectory
 from companion.wire import mavlink as wire
 
 HEARTBEAT_LIMIT_S = 3.0

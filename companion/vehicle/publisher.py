@@ -15,7 +15,8 @@ from companion.core.frames import Ned
 from companion.core.near import PUSH_M_S2, NearMode, near_push_m_s2
 from companion.core.neighbours import PeerTable, predict_sample
 from companion.core.safety.filter import HalfPlane, push_m_s2
-from companion.core.trajectory import Reference, TrajectoryHistory
+from companion.core.trajectory.fleet import Reference
+from companion.core.trajectory.history import TrajectoryHistory
 from companion.core.trigger import Situation
 from companion.core.values import (
     AIRBORNE_PHASES,

@@ -42,7 +42,8 @@ from companion.core.health import Debounce, PositionWatch
 from companion.core.neighbours import PeerTable
 from companion.core.phase import PhaseEvent, next_phase
 from companion.core.rejoin import RejoinTrajectory
-from companion.core.trajectory import Reference, TrajectoryHistory
+from companion.core.trajectory.fleet import Reference
+from companion.core.trajectory.history import TrajectoryHistory
 from companion.core.values import (
     FILTERED_PHASES,
     FLYING_PHASES,

@@ -6,7 +6,7 @@ from math import hypot
 
 from companion.core.frames import Ned
 from companion.core.law.starling import Law
-from companion.core.trajectory import Reference
+from companion.core.trajectory.fleet import Reference
 from companion.core.values import Command, Neighbour, VehicleState
 
 GAIN_PER_S = 3.0

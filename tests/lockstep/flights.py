@@ -13,7 +13,7 @@ import numpy.typing as npt
 from pymavlink.dialects.v20 import development as dialect
 
 from companion.config import FleetConfig, load
-from companion.core.trajectory import TrajectoryHistory
+from companion.core.trajectory.history import TrajectoryHistory
 from companion.core.values import Instant, Phase
 from companion.io.recorder import Entry
 from sim.lockstep.lockstep import UTC_AT_START_NS, Lockstep

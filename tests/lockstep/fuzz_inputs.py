@@ -13,18 +13,11 @@ from typing import Any, Literal, NamedTuple
 
 from companion.config import FleetConfig
 from companion.core.frames import Ned
-from companion.core.trajectory import (
-    BLEND_MIN_S,
-    GOTO_MIN_S,
-    PADS,
-    FleetTrajectory,
-    GotoLeg,
-    Leg,
-    SlotChange,
-    TurnLeg,
-    VelocityLeg,
-    with_legs,
-)
+from companion.core.trajectory.fleet import PADS, FleetTrajectory
+from companion.core.trajectory.goto import GOTO_MIN_S
+from companion.core.trajectory.legs import GotoLeg, Leg, TurnLeg, VelocityLeg
+from companion.core.trajectory.slots import BLEND_MIN_S, SlotChange
+from companion.core.trajectory.successors import with_legs
 from companion.core.trajectory_check import (
     DURATION_MAX_S,
     LEGS_MAX,

@@ -331,7 +331,7 @@ def alone_for_long() -> tuple[float, float]:
     s = scene(change=brief)
     s.ls.partition({1}, {2})
     until(s.ls, 10.0, lambda: s.phase is Phase.DETACHED)
-    s.began_s = first(s.ls, "waiting -> apart", 1)
+    s.began_s = first(s.ls, "waiting -> detached", 1)
     must_end(s, Phase.LANDED)
     return s.noted(Failsafe.ALONE_FOR_LONG), 4.0
 
@@ -622,6 +622,6 @@ def test_a_position_that_jumps_on_the_ground_is_no_failsafe_in_the_air(when: str
         ls.command(b'{"verb":"takeoff"}')
     until_formed(ls)
     assert failsafes(ls) == []
-    assert not any("-> apart" in note for _, _, note in ls.notes)
+    assert not any("-> detached" in note for _, _, note in ls.notes)
     formation, _ = errors(ls, truth(ls, ls.now_ns * 1e-9 - 0.5), [1, 2])
     assert formation.max() < 0.5, "its new origin is known"

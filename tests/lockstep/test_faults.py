@@ -27,7 +27,8 @@ from flights import (
 
 from companion.config import FleetConfig
 from companion.core.frames import Ned
-from companion.core.trajectory import VelocityLeg, with_legs
+from companion.core.trajectory.legs import VelocityLeg
+from companion.core.trajectory.successors import with_legs
 from companion.core.values import Instant, Phase
 from companion.errors import RefusedError
 from companion.operator.client import Operator, turn_leg, velocity_leg
@@ -205,7 +206,7 @@ def test_the_others_hold_their_formation_without_the_one_that_was_taken(taken: T
 def test_a_vehicle_that_hears_nobody_lands_though_they_are_still_said_to_be_there(taken: TakenOver) -> None:
     limits = taken.ls.config.peer_limits
     for i in (1, 3):
-        alone_s = first(taken.ls, "nobody's states heard: hold", i) - taken.cut_s
+        alone_s = first(taken.ls, "nobody's states heard: leave formation", i) - taken.cut_s
         assert limits.isolated_flight_s < alone_s < limits.stale_after_s + limits.isolated_flight_s + 0.5
     assert distances(truth(taken.ls, taken.cut_s)).min() >= CLEARANCE_M
 

@@ -13,7 +13,7 @@ from flights import fleet, parse, until, wait
 from companion.core.frames import Ned
 from companion.core.law.starling import Law
 from companion.core.safety.filter import SafetyFilter
-from companion.core.trajectory import Reference
+from companion.core.trajectory.fleet import Reference
 from companion.core.values import FILTERED_PHASES, Command, Instant, Neighbour, Phase, VehicleState
 from sim.autopilot.faults import Fault, FaultKind
 from sim.lockstep.lockstep import Lockstep

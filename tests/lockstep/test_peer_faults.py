@@ -56,7 +56,7 @@ def test_a_companion_that_knows_not_where_it_is_says_nothing_and_is_known_to_be_
 def test_who_hear_nobodys_states_in_a_turn_stand_apart_and_land(count: int) -> None:
     nearest_m, ls = states_lost(count, seed=2, t_max_s=3.0)
     assert nearest_m >= CLEARANCE_M
-    told = [(i, note) for i, note in failsafes(ls) if "nobody's states heard: hold" in note]
+    told = [(i, note) for i, note in failsafes(ls) if "nobody's states heard: leave formation" in note]
     assert [i for i, _ in sorted(told)] == list(ls.vehicles)
     assert ls.all_in(Phase.LANDED)
 

@@ -14,7 +14,10 @@ from flights import Tape, fleet, launch, straight, until, until_formed, until_la
 
 from companion.config import FleetConfig
 from companion.core.frames import Ned
-from companion.core.trajectory import FleetTrajectory, TrajectoryHistory, VelocityLeg, with_legs
+from companion.core.trajectory.fleet import FleetTrajectory
+from companion.core.trajectory.history import TrajectoryHistory
+from companion.core.trajectory.legs import VelocityLeg
+from companion.core.trajectory.successors import with_legs
 from companion.core.values import Phase
 from companion.wire.mavlink import Px4Mode
 from companion.wire.peer import encode_motion

@@ -20,7 +20,7 @@ from fleet_process import SETTLED, Fleet, all_in, eventually, flight_folder, mak
 from fleet_process import wait_status as wait_for
 from fuzz_inputs import Inputs
 
-from companion.core.trajectory import FleetTrajectory
+from companion.core.trajectory.fleet import FleetTrajectory
 from companion.io.recorder import read_recording
 from companion.io.records import TickRecord
 from companion.io.replay import replay_file

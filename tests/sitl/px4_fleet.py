@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from fleet_process import Fleet, Process, flight_folder, make_fleet, operator_of, started, wait_status
 
-from companion.core.trajectory import TrajectoryHistory
+from companion.core.trajectory.history import TrajectoryHistory
 from companion.io.recorder import read_recording
 from companion.operator.client import Operator
 from companion.wire.mavlink import Px4Mode, dialect, mode_parameters

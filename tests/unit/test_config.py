@@ -16,7 +16,7 @@ from companion.config import FleetConfig, load
 from companion.config.endpoints import autopilot_port, companion_port, serial_endpoint, udp_endpoint
 from companion.config.file import parse
 from companion.core.safety.fence import Fence
-from companion.core.trajectory import GotoLeg, TurnLeg, VelocityLeg
+from companion.core.trajectory.legs import GotoLeg, TurnLeg, VelocityLeg
 from companion.errors import ConfigError
 from sim.__main__ import _resize, plan_legs
 

@@ -25,7 +25,7 @@ from companion.core.law.starling import (
     total,
     within_budget,
 )
-from companion.core.trajectory import Reference
+from companion.core.trajectory.fleet import Reference
 from companion.core.values import Neighbour, VehicleState
 from sim.study.broken_law import GAIN_PER_S, PUSH_MAX_M_S2, BrokenLaw
 

@@ -26,7 +26,11 @@ from companion.core.neighbours import (
 )
 from companion.core.prediction import HoldKind
 from companion.core.safety.filter import nearest_hypothesis
-from companion.core.trajectory import FleetTrajectory, SlotChange, TrajectoryHistory, TurnLeg, VelocityLeg, with_legs
+from companion.core.trajectory.fleet import FleetTrajectory
+from companion.core.trajectory.history import TrajectoryHistory
+from companion.core.trajectory.legs import TurnLeg, VelocityLeg
+from companion.core.trajectory.slots import SlotChange
+from companion.core.trajectory.successors import with_legs
 from companion.core.values import Instant, Neighbour, PeerMessage, PeerSample, Phase
 
 PROPERTY = settings(deadline=None, max_examples=60)

@@ -12,16 +12,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from companion.core.frames import Ned
-from companion.core.trajectory import (
-    BLEND_MIN_S,
-    GOTO_MIN_S,
-    FleetTrajectory,
-    GotoLeg,
-    Leg,
-    SlotChange,
-    TurnLeg,
-    VelocityLeg,
-)
+from companion.core.trajectory.fleet import FleetTrajectory
+from companion.core.trajectory.goto import GOTO_MIN_S
+from companion.core.trajectory.legs import GotoLeg, Leg, TurnLeg, VelocityLeg
+from companion.core.trajectory.slots import BLEND_MIN_S, SlotChange
 from companion.core.trajectory_check import (
     DURATION_MAX_S,
     MOTION_BYTES_MAX,

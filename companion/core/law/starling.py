@@ -27,7 +27,7 @@ from math import fsum, inf, sqrt
 from typing import NamedTuple, Protocol
 
 from companion.core.frames import Ned
-from companion.core.trajectory import Reference
+from companion.core.trajectory.fleet import Reference
 from companion.core.values import Command, Neighbour, VehicleState
 
 DISTANCE_FLOOR_M = 0.2

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from companion.core.trajectory import TrajectoryHistory
+from companion.core.trajectory.history import TrajectoryHistory
 from sim.launch.summary.flight import POSITION, TICK_ROWS, VELOCITY, Array, Flight
 from sim.launch.summary.numbers import rounded
 from sim.launch.summary.steady import errors_from_slots, steady_at

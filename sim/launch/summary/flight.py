@@ -14,7 +14,8 @@ import numpy.typing as npt
 from companion.config import FleetConfig
 from companion.core.counts import Refusal
 from companion.core.events import Event, MotionAdopted
-from companion.core.trajectory import FleetTrajectory, TrajectoryHistory
+from companion.core.trajectory.fleet import FleetTrajectory
+from companion.core.trajectory.history import TrajectoryHistory
 from companion.errors import WireError
 from companion.io.recorder import Entry, RecordingError, read_recording
 from companion.io.records import TickRecord, TrafficRecord

@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from companion.core.events import PhaseChanged
 from companion.core.monitor import algebraic_connectivity, centroid_error_m, formation_error_m, velocity_error_m_s
-from companion.core.trajectory import TrajectoryHistory
+from companion.core.trajectory.history import TrajectoryHistory
 from companion.core.values import Phase
 from sim.launch.summary.flight import Array, Flight
 from sim.launch.summary.numbers import rounded
