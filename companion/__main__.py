@@ -3,22 +3,27 @@
 import json
 import os
 import sys
-from importlib.metadata import version
+from dataclasses import asdict
 from pathlib import Path
 from time import process_time
 from typing import Annotated
 
 import typer
 
-from companion.config import load
-from companion.errors import CompanionError
+from companion.errors import CompanionError, RefusedError
+from companion.operator import verbs
 
 app = typer.Typer(
     no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, help="One vehicle's companion process."
 )
+operator_app = typer.Typer(no_args_is_help=True, help="Command and ask a running fleet, without the simulator.")
+verbs.mount(operator_app)
+app.add_typer(operator_app, name="operator")
 USAGE_ERROR = 2
 DIFFERENT = 1
 """a replay that differs, a check that is not met"""
+REFUSED = 1
+"""an operator's verb that nobody was commanded"""
 
 
 @app.command()
@@ -35,12 +40,15 @@ def run(
     Exit status: 0 ended with the vehicle landed or landing, 2 wrong usage or configuration, 3 ended while the autopilot
     had not confirmed landing, 4 could do nothing any more (a fault of ours; the autopilot's failsafe has the vehicle).
     """
+    from companion.config import load
     from companion.io.loop import RunSettings
     from companion.io.process import run_companion
 
     def log(text: str) -> None:
         # Not through a buffer, which on a full disk would fail again at the end and change the exit status.
         os.write(1, f"vehicle {vehicle}: {text}\n".encode())
+
+    from importlib.metadata import version
 
     config = load(fleet)
     settings = RunSettings(vehicle, record, sys.stdin.fileno() if launched else None, log, fleet)
@@ -61,9 +69,9 @@ def check(
     Needs the vehicle's link for itself: stop its companion first. Exit status: 0 all met, 1 a row is not met, 2 wrong
     usage or configuration.
     """
+    from companion.config import load
     from companion.io.check import hardware_checks
-    from companion.vehicle.preflight import as_json as row_json
-    from companion.vehicle.preflight import unmet
+    from companion.wire.operator import unmet
 
     config = load(fleet)
     rows = []
@@ -74,7 +82,7 @@ def check(
             typer.echo(f"{'ok' if row.passed else 'FAULT':5}  {row.name:20}  {value!s:>20}  {row.limit}")
     faults = unmet(rows)
     if as_json:
-        typer.echo(json.dumps({"fit": not faults, "checks": [row_json(r) for r in rows]}))
+        typer.echo(json.dumps({"fit": not faults, "checks": [asdict(r) for r in rows]}))
     else:
         for fault in faults:
             typer.echo(fault.message)
@@ -106,7 +114,7 @@ def main() -> None:
         app(standalone_mode=True)
     except CompanionError as error:
         typer.echo(f"companion: {error}", err=True)
-        raise SystemExit(USAGE_ERROR) from None
+        raise SystemExit(REFUSED if isinstance(error, RefusedError) else USAGE_ERROR) from None
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ class WireError(CompanionError):
     def __init__(self, kind: str, detail: str = "") -> None:
         super().__init__(f"{kind}: {detail}" if detail else kind)
         self.kind = kind
+        self.detail = detail
 
 
 class RefusedError(CompanionError):

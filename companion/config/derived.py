@@ -10,11 +10,12 @@ from typing import Literal
 from companion.config.endpoints import companion_port
 from companion.config.numbers import Table
 from companion.config.schema import FleetTables, GotoLegTable, HoldLegTable, LegTable, TurnLegTable, VelocityLegTable
+from companion.core import assignment
 from companion.core.formation import SHAPES, Slots, centred, minimum_distance, rotated, shape_slots
 from companion.core.frames import Geodetic, Ned
 from companion.core.law.starling import Gains, paper_gains
 from companion.core.monitor import PeerMotion
-from companion.core.neighbours import PeerLimits
+from companion.core.neighbours.sample import PeerLimits
 from companion.core.safety.fence import Fence
 from companion.core.safety.filter import DOWNWASH_RATIO, SafetyLimits, safety_radius_m
 from companion.core.trajectory.fleet import PADS, FleetTrajectory, top_speed_m_s
@@ -193,7 +194,7 @@ class FleetConfig(FleetTables):
     def motion_limits(self) -> MotionLimits:
         """What every motion must keep, whoever proposes it."""
         x = self.limits
-        # Slots that change places by the assignment stay 1/sqrt(2) of their distance apart (`formation.assign`): with
+        # Slots that change places by the assignment stay 1/sqrt(2) of their distance apart (`assignment.assign`): with
         # the offsets u before and w after of a pair u.w >= 0, since exchanging the two would else cost less.
         apart_m = self.safety_radius_m / sqrt(2.0) if x.barrier else 0.0
         return MotionLimits(x.speed_max_m_s, x.climb_max_m_s, x.descent_max_m_s, apart_m, self.geofence)
@@ -353,6 +354,19 @@ class FleetConfig(FleetTables):
                     leg = self.waypoint(place, velocity, table)
             yield leg
             _, place, velocity, _ = leg_end(leg, place, velocity)
+
+    @cached_property
+    def first_formation(self) -> FleetTrajectory:
+        """The change of formation that the vehicles begin with: from their pads to the slots as all assign them."""
+        return self.motion_into(self.formation.shape, self.first_motion, self.first_motion.start_ns, 0)
+
+    @cached_property
+    def assignment_hash(self) -> str:
+        """Digest of who takes which slot of the first formation, to a millimetre, and of the rule that says so."""
+        slots = self.first_formation.slots
+        text = "".join(f"{i}:{','.join(f'{x + 0.0:.3f}' for x in slots[i].after)};" for i in sorted(slots))
+        text = f"{assignment.VERSION}|{text}"
+        return blake2s(text.replace("-0.000", "0.000").encode(), digest_size=8).hexdigest()
 
     @cached_property
     def shared_hash(self) -> str:

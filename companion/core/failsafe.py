@@ -62,6 +62,18 @@ class Failsafe(Enum):
     NOT_FINITE = "a number not finite, a message malformed"
 
 
+@unique
+class NoticedBy(Enum):
+    """Who notices a failsafe."""
+
+    DETECTOR = "a detector of the supervisor's (`vehicle.detectors`)"
+    PEER_TABLE = "the table of peers (`core.neighbours`)"
+    AGENT = "the agent, at its inputs and ticks"
+    PROCESS = "the process around the agent (`io`)"
+    AUTOPILOT = "the autopilot alone: its own failsafe acts"
+    NOBODY = "nobody"
+
+
 class Row(NamedTuple):
     """One failsafe."""
 
@@ -73,6 +85,7 @@ class Row(NamedTuple):
     more: str
     """what else is done, or why so"""
     left: str
+    by: NoticedBy = NoticedBy.DETECTOR
 
 
 STALE_S = 0.5
@@ -82,6 +95,8 @@ LOST_S = 1.5
 HEARTBEAT_S = 3.0
 UNCERTAIN_S = 2.0
 """ESTIMATOR_STATUS comes once a second: two in a row"""
+ACCURACY_LIMIT_M = 3.0
+"""PX4's own limit for arming (EKF2_REQ_EPH); flags alone stay up for seconds after the position sensor's end"""
 STATUS_S = 5.0
 """ESTIMATOR_STATUS or SYS_STATUS, which come once a second, older than this: what it said is unknown"""
 BATTERY_S = 3.0
@@ -162,11 +177,15 @@ FAILSAFES: dict[Failsafe, Row] = {
     Failsafe.PEER_GONE: Row(
         "milliseconds when the process ends, the lease (4 s) when its machine or radio does", None, Action.CONTINUE,
         "all the distance is kept to everywhere it may be: flown on with the plan, or stopped", "it is heard again",
+        by=NoticedBy.PEER_TABLE,
     ),
-    Failsafe.PEER_SILENT: Row("2.1 `trigger.t_max_s`", None, Action.CONTINUE, "the same", "it is heard again"),
+    Failsafe.PEER_SILENT: Row(
+        "2.1 `trigger.t_max_s`", None, Action.CONTINUE, "the same", "it is heard again", by=NoticedBy.PEER_TABLE,
+    ),
     Failsafe.PEER_FROZEN: Row(
         "its samples repeat a position for 0.5 s at more than 0.1 m/s", FROZEN_S, Action.CONTINUE,
         "not used in the formation, all the distance is kept to it, counted", "5 s without another",
+        by=NoticedBy.PEER_TABLE,
     ),
     Failsafe.PEER_LIES: Row(
         "the first sample further than 1 m (1 m/s) from what was foreseen, beyond what a second of 8 m/s2 explains, or "
@@ -174,21 +193,25 @@ FAILSAFES: dict[Failsafe, Row] = {
         "not used in the formation; all the distance is kept to both places, counted",
         "one of them is not told of for 2.1 `trigger.t_max_s`; of a vehicle lost in the air while elsewhere one says "
         "that it stands, for 120 s",
+        by=NoticedBy.PEER_TABLE,
     ),
     Failsafe.PEER_CLOCK: Row(
         "a sample from more than 1 s ahead, or older on arrival than 2.1 `trigger.t_max_s`", 0.0, Action.CONTINUE,
         "refused and counted; then it is silent", "its clock is right",
+        by=NoticedBy.PEER_TABLE,
     ),
     Failsafe.TWO_SOURCES: Row(
         "a boot id that speaks again after another has begun", 0.0, Action.CONTINUE,
         "not used in the formation; all the distance is kept to every place that is told, counted, noted",
         "2.1 `trigger.t_max_s` without the other",
+        by=NoticedBy.PEER_TABLE,
     ),
     Failsafe.OWN_ID: Row(
         "the first put under the own id", 0.0, Action.CONTINUE,
         "not taken; it says at once where it is itself (twice a second at most), counted, noted, no take-off by "
         "`fleet preflight`; to land for it would let one put end a flight",
         "2.1 `trigger.t_max_s` without another",
+        by=NoticedBy.AGENT,
     ),
     Failsafe.BATTERY_LOW: Row(
         "3 s below `failsafe.battery_low_percent`", BATTERY_S, Action.RETURN,
@@ -203,23 +226,34 @@ FAILSAFES: dict[Failsafe, Row] = {
     Failsafe.LOOP_LATE: Row(
         "0.2 s between two control ticks", LATE_S, Action.CONTINUE,
         "counted; from COM_OF_LOSS_T on the autopilot's failsafe acts", "the next tick",
+        by=NoticedBy.AGENT,
     ),
-    Failsafe.DISK_FULL: Row("the first write that fails", None, Action.CONTINUE, "losses are counted", "there is room"),
+    Failsafe.DISK_FULL: Row(
+        "the first write that fails", None, Action.CONTINUE, "losses are counted", "there is room",
+        by=NoticedBy.PROCESS,
+    ),
     Failsafe.CONFIGURATION: Row(
         "5 s", None, Action.CONTINUE, "noted; the vehicle flies on what it was started with", "a new start",
+        by=NoticedBy.PROCESS,
     ),
     Failsafe.KILLED: Row(
         "the autopilot's COM_OF_LOSS_T (1.0 s)", 1.0, Action.HAND_OVER,
         "the autopilot's COM_OBL_RC_ACT; launchers set 4, land; in the climb it climbs on and holds; "
         "one that starts in flight steers only on command",
         "`fleet resume`",
+        by=NoticedBy.AUTOPILOT,
     ),
     Failsafe.STOPPED: Row(
         "SIGTERM, SIGINT, the launcher's end: at once", 0.0, Action.LAND,
         "it ends once the autopilot confirms (3 s, or 1.2 s without a launcher)", _NOT,
+        by=NoticedBy.PROCESS,
     ),
-    Failsafe.OPERATOR: Row("not at all", None, Action.CONTINUE, "nothing in flight needs the operator", _NOT),
-    Failsafe.NOT_FINITE: Row("at once", 0.0, Action.CONTINUE, "refused and counted; never in a setpoint", _NOT),
+    Failsafe.OPERATOR: Row(
+        "not at all", None, Action.CONTINUE, "nothing in flight needs the operator", _NOT, by=NoticedBy.NOBODY,
+    ),
+    Failsafe.NOT_FINITE: Row(
+        "at once", 0.0, Action.CONTINUE, "refused and counted; never in a setpoint", _NOT, by=NoticedBy.AGENT,
+    ),
 }  # fmt: skip
 
 

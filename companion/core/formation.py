@@ -5,10 +5,8 @@ its slots; a heading turns them into the fleet frame. Shapes exist for every N >
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from math import ceil, cos, pi, sin, sqrt
-
-import numpy as np
-from scipy.optimize import linear_sum_assignment
+from itertools import combinations
+from math import ceil, cos, inf, pi, sin, sqrt
 
 from companion.core.frames import Ned
 
@@ -104,32 +102,12 @@ def rotated(slots: Sequence[Ned], heading_rad: float) -> Slots:
     return tuple(Ned(c * f - s * r, s * f + c * r, d) for f, r, d in slots)
 
 
-def pairwise_distances_m(slots: Sequence[Sequence[float]], vertical_scale: float = 1.0) -> np.ndarray:
-    """Distances of all pairs (m), shape (n (n-1)/2,), in order (0,1), (0,2), ...; down divided by `vertical_scale`."""
-    points = np.asarray(slots, dtype=float).reshape(-1, 3) / np.array([1.0, 1.0, vertical_scale])
-    i, j = np.triu_indices(len(points), 1)
-    return np.asarray(np.linalg.norm(points[i] - points[j], axis=1))
+def pairwise_distances_m(slots: Sequence[Sequence[float]], vertical_scale: float = 1.0) -> list[float]:
+    """Distances of all pairs (m) in order (0,1), (0,2), ...; down divided by `vertical_scale`."""
+    points = [(north, east, down / vertical_scale) for north, east, down in slots]
+    return [sqrt((a - d) ** 2 + (b - e) ** 2 + (c - f) ** 2) for (a, b, c), (d, e, f) in combinations(points, 2)]
 
 
 def minimum_distance(slots: Sequence[Sequence[float]], vertical_scale: float = 1.0) -> float:
     """Smallest distance of any pair (m); infinite for fewer than two."""
-    return float(pairwise_distances_m(slots, vertical_scale).min(initial=np.inf))
-
-
-def assign(origins: Sequence[Ned], slots: Sequence[Ned], pinned: Mapping[int, int] | None = None) -> tuple[int, ...]:
-    """Slot of each vehicle: the assignment with the least sum of squared distances (Hungarian method).
-
-    `pinned` fixes the slots of some (index of the origin -> index of the slot).
-
-    Both lists are nominal (pads or slots of the last formation, and slots of the next, about one common centre), never
-    measured: every vehicle must come to the same result. Squared distances make straight paths flown together keep
-    apart. Costs are rounded to a millimetre squared, so that the last bit of a sine cannot decide between two equals.
-    """
-    a = np.asarray(origins, dtype=float).reshape(-1, 3)
-    b = np.asarray(slots, dtype=float).reshape(-1, 3)
-    cost = np.round(((a[:, None, :] - b[None, :, :]) ** 2).sum(axis=2), 6)
-    for row, slot in (pinned or {}).items():
-        cost[row, :], cost[:, slot] = 1e12, 1e12
-        cost[row, slot] = 0.0
-    _, columns = linear_sum_assignment(cost)
-    return tuple(int(c) for c in columns)
+    return min(pairwise_distances_m(slots, vertical_scale), default=inf)

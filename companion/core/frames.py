@@ -5,10 +5,12 @@ longitude, AMSL altitude). Every autopilot has a local NED frame of its own, who
 happened to start (GPS_GLOBAL_ORIGIN, MAVLink 49). Positions are shifted by the difference of the two origins.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import cos, degrees, hypot, radians, sin
 from typing import NamedTuple
 
-import pymap3d
+SEMIMAJOR_M, SEMIMINOR_M = 6378137.0, 6356752.31424518
+"""of the WGS84 ellipsoid (NIMA TR8350.2)"""
 
 
 class Ned(NamedTuple):
@@ -37,24 +39,46 @@ def geodetic_to_ned(point: Geodetic, origin: Geodetic) -> Ned:
     North and east are those of the tangent plane at the origin. Down is the difference of the two AMSL altitudes and
     not the tangent plane's, so that two vehicles at one altitude are level however far apart they are.
     """
-    east, north, _ = pymap3d.geodetic2enu(
-        point.latitude_deg, point.longitude_deg, 0.0, origin.latitude_deg, origin.longitude_deg, 0.0
+    latitude, longitude = radians(origin.latitude_deg), radians(origin.longitude_deg)
+    x, y, z = (a - b for a, b in zip(_on_the_ellipsoid_m(point), _on_the_ellipsoid_m(origin), strict=True))
+    outward = cos(longitude) * x + sin(longitude) * y
+    return Ned(
+        -sin(latitude) * outward + cos(latitude) * z,
+        -sin(longitude) * x + cos(longitude) * y,
+        origin.altitude_amsl_m - point.altitude_amsl_m,
     )
-    return Ned(float(north), float(east), origin.altitude_amsl_m - point.altitude_amsl_m)
+
+
+def _on_the_ellipsoid_m(point: Geodetic) -> tuple[float, float, float]:
+    """Earth-centred, earth-fixed coordinates (m) of the point's foot on the ellipsoid."""
+    latitude, longitude = radians(point.latitude_deg), radians(point.longitude_deg)
+    prime_vertical = SEMIMAJOR_M**2 / hypot(SEMIMAJOR_M * cos(latitude), SEMIMINOR_M * sin(latitude))
+    return (
+        prime_vertical * cos(latitude) * cos(longitude),
+        prime_vertical * cos(latitude) * sin(longitude),
+        prime_vertical * (SEMIMINOR_M / SEMIMAJOR_M) ** 2 * sin(latitude),
+    )
 
 
 def ned_to_geodetic(position_ned_m: Ned, origin: Geodetic) -> Geodetic:
-    """Inverse of `geodetic_to_ned`, to a millimetre within some kilometres of the origin."""
+    """Inverse of `geodetic_to_ned`, to a millimetre within some kilometres of the origin and away from the poles.
+
+    What is still missing is added, as degrees by the ellipsoid's two radii of curvature at the origin; each round
+    leaves a part in some hundred (at 80 degrees, 5 km away) or less.
+    """
     north, east, down = position_ned_m
-    # On the ellipsoid the tangent plane's point lies lower by the curvature; two corrections suffice for a millimetre.
-    up = 0.0
-    latitude = longitude = 0.0
-    for _ in range(3):
-        latitude, longitude, height = pymap3d.enu2geodetic(
-            east, north, up, origin.latitude_deg, origin.longitude_deg, 0.0
+    latitude = radians(origin.latitude_deg)
+    prime_vertical = SEMIMAJOR_M**2 / hypot(SEMIMAJOR_M * cos(latitude), SEMIMINOR_M * sin(latitude))
+    meridian = prime_vertical**3 * SEMIMINOR_M**2 / SEMIMAJOR_M**4
+    point = Geodetic(origin.latitude_deg, origin.longitude_deg, origin.altitude_amsl_m - down)
+    for _ in range(6):
+        here = geodetic_to_ned(point, origin)
+        point = Geodetic(
+            point.latitude_deg + degrees((north - here.north) / meridian),
+            point.longitude_deg + degrees((east - here.east) / (prime_vertical * cos(latitude))),
+            point.altitude_amsl_m,
         )
-        up -= float(height)
-    return Geodetic(float(latitude), float(longitude), origin.altitude_amsl_m - down)
+    return replace(point, longitude_deg=(point.longitude_deg + 180.0) % 360.0 - 180.0)
 
 
 @dataclass(frozen=True, slots=True)

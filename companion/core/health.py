@@ -83,3 +83,57 @@ class Debounce:
         if self._since_ns is None:
             self._since_ns = monotonic_ns
         return monotonic_ns - self._since_ns >= round(self.limit_s * 1e9)
+
+
+@dataclass(slots=True)
+class JumpSeries:
+    """Jumps of the position that follow each other."""
+
+    gap_s: float
+    """a jump so long after the last one begins another series"""
+    begun_ns: int | None = None
+    """monotonic; None: no jump yet"""
+    _last_ns: int = 0
+
+    def restart(self) -> None:
+        """The next jump begins a series."""
+        self.begun_ns = None
+
+    def take(self, monotonic_ns: int) -> None:
+        """A jump came."""
+        if self.begun_ns is None or monotonic_ns - self._last_ns >= self.gap_s * 1e9:
+            self.begun_ns = monotonic_ns
+        self._last_ns = monotonic_ns
+
+
+FALL_M_S = 4.0
+"""no autopilot sinks so fast on its own motors (PX4's limits of descent end there): who does falls"""
+FALL_NS = 10_000_000_000
+"""a fall so shortly before or after the motors were seen to stop has to do with it"""
+
+
+@dataclass(slots=True)
+class FallWatch:
+    """Whether motors stopped in the air: whoever does it disarms a vehicle that falls."""
+
+    _fell_ns: int | None = None
+    _disarmed_ns: int | None = None
+
+    def restart(self) -> None:
+        """Forget: another take-off begins."""
+        self._fell_ns = self._disarmed_ns = None
+
+    def see(self, down_m_s: float, monotonic_ns: int) -> None:
+        """Take the vertical velocity."""
+        if down_m_s > FALL_M_S:
+            self._fell_ns = monotonic_ns
+
+    def disarmed(self, monotonic_ns: int) -> None:
+        """A flight was seen to be over."""
+        self._disarmed_ns = monotonic_ns
+
+    @property
+    def motors_stopped(self) -> bool:
+        """Whether the vehicle fell about when it was disarmed."""
+        fell, disarmed = self._fell_ns, self._disarmed_ns
+        return fell is not None and disarmed is not None and abs(fell - disarmed) <= FALL_NS

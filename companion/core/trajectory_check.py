@@ -6,7 +6,7 @@ slots fly, how low, how near each other, and whether it stays inside the fence. 
 counted in looks (`core.route`): the same motion costs every vehicle the same.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from math import hypot, inf, pi, radians, sqrt
 from typing import NamedTuple
@@ -48,6 +48,8 @@ HEADING_MAX_RAD = 2.0 * pi
 
 # -- what the motion as a whole must keep ----------------------------------------------------------------------------
 
+REVISION_JUMP_MAX = 10_000
+"""no motion is further ahead than this of those that are known: nobody may use up the revisions for all others"""
 PLAN_SPEED_SHARE = 0.75
 """part of the speed limits that the centre may use; the rest is left to slots that turn or change, and to keep up"""
 ALTITUDE_MIN_M = 1.0
@@ -265,3 +267,14 @@ def examine(motion: FleetTrajectory, limits: MotionLimits, before: FleetTrajecto
         sentence = "it climbs or sinks for ever; give an altitude to go to"
         fault = Fault(RefusalKind.CLIMB, sentence, len(motion.legs) - 1)
     return Examination(None if fault is None else fault._replace(permanent=not stops), looks)
+
+
+def revision_fault(revision: int, own: int, told: Iterable[int]) -> str | None:
+    """Why a motion's revision is out of all order: too far ahead of one's own newest and of every one `told` by a peer.
+
+    Whoever starts late holds revision 0 and hears from the others' states how far they are.
+    """
+    newest = max([own, *told])
+    if revision > newest + REVISION_JUMP_MAX:
+        return f"its revision {revision} is more than {REVISION_JUMP_MAX} ahead of {newest}, the newest known"
+    return None

@@ -1,32 +1,30 @@
 """The operator's questions, answered by the vehicle's loop once what cannot wait is done."""
 
-import json
 from collections.abc import Callable
-from typing import Any
 
 from companion.core.values import Instant
 from companion.io.clock import FleetClock
 from companion.io.transport import Request
 from companion.vehicle.guard import Guard
-from companion.vehicle.preflight import ClockReading
+from companion.wire.operator import CLOCK_QUESTION, ClockReading, Status, encode
 
 STATUS_LASTS_NS = 50_000_000
 """a status this old is told again: making one takes a good part of a control period; a command makes it anew"""
 
 
 class Answers:
-    """`process_facts` are what a status says of the process around the agent."""
+    """`complete` adds to a status what the process around the agent knows."""
 
     def __init__(
         self,
         guard: Guard,
         clock: FleetClock,
-        process_facts: Callable[[Instant], dict[str, Any]],
+        complete: Callable[[Status], Status],
         record: Callable[[str, Instant, bytes], None],
     ) -> None:
         self._guard = guard
         self._clock = clock
-        self._process_facts = process_facts
+        self._complete = complete
         self._record = record
         self._status: bytes | None = None
         self._status_ns = 0
@@ -52,12 +50,11 @@ class Answers:
 
     def _preflight(self, request: Request, now: Instant) -> bytes:
         agent = self._guard.agent
-        if request.payload != b"clock":
-            return agent.operator.preflight_report(now).model_dump_json().encode()
+        if request.payload != CLOCK_QUESTION:
+            return encode(agent.operator.preflight_report(now))
         received_ns = self._clock.at(request.received_monotonic_ns).fleet_ns
         answered_ns = self._clock.now().fleet_ns
-        reading = ClockReading(boot_id=agent.boot_id, received_ns=received_ns, answered_ns=answered_ns)
-        return reading.model_dump_json().encode()
+        return encode(ClockReading(boot_id=agent.boot_id, received_ns=received_ns, answered_ns=answered_ns))
 
     def _recent_status(self, now: Instant) -> bytes | None:
         if self._status is None or now.monotonic_ns - self._status_ns > STATUS_LASTS_NS:
@@ -66,8 +63,4 @@ class Answers:
         return self._status
 
     def _make_status(self, now: Instant) -> bytes:
-        status = self._guard.agent.status(now)
-        facts = self._process_facts(now)
-        rejected = {**status["rejected"], **facts.pop("rejected")}
-        rejected |= {f"raised: {kind}": count for kind, count in self._guard.raised.items()}
-        return json.dumps({**status, **facts, "rejected": rejected}).encode()
+        return encode(self._complete(self._guard.agent.status(now)))

@@ -20,8 +20,10 @@ from companion.errors import CompanionError
 from companion.io.clock import FleetClock
 from companion.io.link import Link, open_link
 from companion.io.network import operator_link
+from companion.vehicle.autopilot.port import AutopilotPort
 from companion.vehicle.autopilot.px4 import Px4Autopilot
-from companion.vehicle.preflight import Check, own_checks, tidy
+from companion.vehicle.preflight import own_checks
+from companion.wire.operator import Check, tidy
 
 FREE_LEAST_GB = 1.0
 """a recording takes 25 MB for half an hour; nobody deletes the old ones"""
@@ -62,30 +64,29 @@ def _autopilot(config: FleetConfig, vehicle: Vehicle, seconds: float) -> Iterato
         return
     try:
         yield Check("link", vehicle.mavlink, "opens", True, "")
-        origin = config.origin if config.fleet.frame == "global" else None
-        client = Px4Autopilot(vehicle.system_id, origin, config.limits.control_rate_hz)
+        autopilot = Px4Autopilot(config, vehicle)
         clock = FleetClock()
-        received = listen(link, client, clock, seconds)
+        received = listen(link, autopilot, clock, seconds)
         yield Check("bytes", received, "> 0", received > 0, f"nothing came on {vehicle.mavlink} in {seconds:g} s")
-        damaged = client.rejected["malformed"]
+        damaged = autopilot.rejected["malformed"]
         yield Check("damaged frames", damaged, "= 0", damaged == 0, f"{damaged} frames came damaged: baud rate, cable?")
-        yield from own_checks(client.facts(clock.now()), config, vehicle)
+        yield from own_checks(autopilot.facts(clock.now()), config, vehicle)
     finally:
         link.close()
 
 
-def listen(link: Link, client: Px4Autopilot, clock: FleetClock, seconds: float) -> int:
+def listen(link: Link, autopilot: AutopilotPort, clock: FleetClock, seconds: float) -> int:
     """Hear and ask the autopilot for a while; how many bytes came."""
     received = 0
     end_ns = time.monotonic_ns() + round(seconds * 1e9)
     while (now_ns := time.monotonic_ns()) < end_ns:
-        until_ns = min(client.next_deadline_ns(), end_ns)
+        until_ns = min(autopilot.next_deadline_ns(), end_ns)
         ready, _, _ = select.select([link], [], [], max(until_ns - now_ns, 0) * 1e-9)
         for datagram, received_ns, address in link.receive() if ready else ():
             received += len(datagram)
-            if link.admits(address, received_ns) and client.receive(datagram, clock.at(received_ns)).autopilot:
+            if link.admits(address, received_ns) and autopilot.receive(datagram, clock.at(received_ns)).autopilot:
                 link.confirm(address, received_ns)
-        for datagram in client.due(clock.now()):
+        for datagram in autopilot.due(clock.now()):
             link.send(datagram)
     return received
 

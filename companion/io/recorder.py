@@ -34,7 +34,7 @@ from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Final, Self, TypeVar
+from typing import IO, Final, NamedTuple, Self, TypeVar
 
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import EndOfFile, McapError
@@ -68,7 +68,15 @@ _SEQUENCE_MASK: Final = 0xFFFF_FFFF
 
 _AMONG_ENTRIES: Final = frozenset({Opcode.HEADER, Opcode.METADATA, Opcode.SCHEMA, Opcode.ATTACHMENT})
 _Record = TypeVar("_Record")
-_Pending = tuple[int, str, Instant, bytes]
+
+
+class _Pending(NamedTuple):
+    """One call of `Recorder.record`, on its way to the disk."""
+
+    sequence: int
+    channel: str
+    instant: Instant
+    body: bytes
 
 
 class RecordingError(CompanionError):
@@ -140,7 +148,7 @@ class Recorder:
         if self._closed or len(self._queue) >= self._capacity:
             self._refused += 1
         else:
-            self._queue.append((sequence, channel, now, body))
+            self._queue.append(_Pending(sequence, channel, now, body))
 
     @property
     def lost(self) -> int:
@@ -208,10 +216,10 @@ class Recorder:
     def _count(self, batch: list[_Pending]) -> None:
         statistics = self._statistics
         counts = statistics.channel_message_counts
-        for name, count in Counter(name for _, name, _, _ in batch).items():
+        for name, count in Counter(entry.channel for entry in batch).items():
             channel = self._channels[name]
             counts[channel] = counts.get(channel, 0) + count
-        first, last = batch[0][2].fleet_ns, batch[-1][2].fleet_ns  # fleet time does not go back
+        first, last = batch[0].instant.fleet_ns, batch[-1].instant.fleet_ns  # fleet time does not go back
         if statistics.message_count == 0:
             statistics.message_start_time = max(0, first)
         statistics.message_end_time = max(0, last)

@@ -5,21 +5,21 @@ A vehicle on its own cannot know that another's file, clock, altitude or place d
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import combinations
-from math import hypot, inf, sqrt
+from math import inf
 from statistics import median
 from typing import Any
 
 from companion.config import FleetConfig
 from companion.core.formation import minimum_distance
-from companion.core.frames import Ned
-from companion.core.safety.filter import DOWNWASH_RATIO
-from companion.core.trajectory.fleet import FleetTrajectory, top_speed_m_s
+from companion.core.trajectory.fleet import top_speed_m_s
 from companion.core.trajectory.successors import with_legs
 from companion.core.trajectory_check import ALTITUDE_MIN_M, PLAN_SPEED_SHARE, SPEED_SLACK
 from companion.core.values import ZERO
-from companion.vehicle.preflight import Check, PreflightReport, as_json, assignment_hash, first_formation, tidy, unmet
+from companion.operator.clocks import ClockOffset
+from companion.operator.ways import change_distances_m, level_distance_m, ways_apart_m
+from companion.wire.operator import Check, PreflightReport, tidy, unmet
 
 BODY_M = 0.5
 """closer than this two vehicles touch; what is kept where the barrier is off"""
@@ -28,29 +28,7 @@ OPERATOR_CLOCK_LIMIT_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class ClockOffset:
-    """A vehicle's fleet time minus the operator's UTC."""
-
-    ahead_s: float
-    uncertain_s: float
-    """half the question's time on the way"""
-
-
-def best_offset(
-    readings: list[tuple[int, int, int, int]],
-) -> ClockOffset | None:
-    """The least delayed of several readings (asked, received there, answered there, answer here; ns each)."""
-    found = None
-    for asked, received, answered, back in readings:
-        uncertain = ((back - asked) - (answered - received)) * 0.5e-9
-        ahead = ((received - asked) + (answered - back)) * 0.5e-9
-        if uncertain >= 0.0 and (found is None or uncertain < found.uncertain_s):
-            found = ClockOffset(ahead, uncertain)
-    return found
-
-
-@dataclass(frozen=True, slots=True)
-class Report:
+class FleetReport:
     """Every row of every vehicle and of the fleet."""
 
     checks: tuple[Check, ...]
@@ -72,32 +50,32 @@ class Report:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
-        return {"fit": self.fit, "faults": self.faults, "checks": [as_json(c) for c in self.checks]}
+        return {"fit": self.fit, "faults": self.faults, "checks": [asdict(c) for c in self.checks]}
 
 
 def fleet_report(
     config: FleetConfig,
-    accounts: Mapping[int, PreflightReport | None],
+    reports: Mapping[int, PreflightReport | None],
     offsets: Mapping[int, ClockOffset | None],
     boots: Mapping[int, frozenset[int]],
     unreadable: Mapping[int, str] | None = None,
-) -> Report:
-    """All rows: `accounts` by vehicle id (None: silent), `boots`: the processes that answered under each id;
+) -> FleetReport:
+    """All rows: `reports` by vehicle id (None: silent), `boots`: the processes that answered under each id;
     `unreadable`: what is wrong with an answer of another form."""
-    heard = {i: a for i, a in accounts.items() if a is not None}
+    heard = {i: a for i, a in reports.items() if a is not None}
     unreadable = unreadable or {}
-    silent = [i for i, a in accounts.items() if a is None and i not in unreadable]
+    silent = [i for i, a in reports.items() if a is None and i not in unreadable]
     rows = [
         Check(
-            "vehicles heard", len(heard), f"= {len(accounts)}", not silent,
+            "vehicles heard", len(heard), f"= {len(reports)}", not silent,
             f"not heard: vehicle {', '.join(str(i) for i in silent)}",
         )
     ]  # fmt: skip
     for i, why in unreadable.items():
         says = f"its answer cannot be read ({why}): is its companion of another version?"
         rows.append(Check("answer", None, "of this version's form", False, says, True, i))
-    for account in heard.values():
-        rows += account.checks
+    for report in heard.values():
+        rows += report.checks
     rows += _identities(config, heard, boots)
     rows += _agreement(config, heard)
     rows += _clocks(config, heard, offsets)
@@ -105,7 +83,7 @@ def fleet_report(
     rows += _starts(config, heard)
     rows += _change(config, heard)
     rows += _plan(config)
-    return Report(tuple(rows))
+    return FleetReport(tuple(rows))
 
 
 def _identities(
@@ -132,7 +110,7 @@ def _identities(
 
 
 def _agreement(config: FleetConfig, heard: Mapping[int, PreflightReport]) -> Iterator[Check]:
-    assignment = assignment_hash(config)
+    assignment = config.assignment_hash
     for i, a in heard.items():
         same = a.configuration == config.shared_hash
         yield Check(
@@ -197,7 +175,7 @@ def _references(config: FleetConfig, heard: Mapping[int, PreflightReport]) -> It
             f"{name} are {spread:.2f} m apart, may be {limits.altitude_spread_m:g} m: {_extremes(values)}",
         )  # fmt: skip
     origins = {i: a.origin_ned_m for i, a in heard.items() if a.origin_ned_m is not None}
-    pairs = {(i, j): _level(p, q) for (i, p), (j, q) in combinations(origins.items(), 2)}
+    pairs = {(i, j): level_distance_m(p, q) for (i, p), (j, q) in combinations(origins.items(), 2)}
     (i, j), apart = max(pairs.items(), key=lambda item: item[1], default=((0, 0), 0.0))
     yield Check(
         "estimator origins", tidy(apart), f"<= {limits.origin_limit_m:g} m apart", apart <= limits.origin_limit_m,
@@ -228,17 +206,22 @@ def _starts(config: FleetConfig, heard: Mapping[int, PreflightReport]) -> Iterat
         p, q = a.position_ned_m, b.position_ned_m
         assert p is not None
         assert q is not None
-        apart = _level(p, q)
+        apart = level_distance_m(p, q)
         nearest = min(nearest, apart)
         if apart < least:
             close.append(f"vehicle {i} and {j} stand {apart:.2f} m apart")
             continue
-        way = _ways_apart(p, a.slot_ned_m, q, b.slot_ned_m)
+        way = ways_apart_m(p, a.slot_ned_m, q, b.slot_ned_m)
         nearest_way = min(nearest_way, way)
         if way < least:
             crossing.append(f"ways of vehicle {i} and {j} from where they stand come within {way:.2f} m")
     aloft = {i: a.position_ned_m for i, a in heard.items() if a.position_ned_m is not None and a.flying}
-    over = {(i, j): _level(a.position_ned_m, q) for i, a in known.items() if a.position_ned_m for j, q in aloft.items()}
+    over = {
+        (i, j): level_distance_m(a.position_ned_m, q)
+        for i, a in known.items()
+        if a.position_ned_m
+        for j, q in aloft.items()
+    }
     under = [f"vehicle {j} flies {d:.2f} m from over vehicle {i}'s start" for (i, j), d in over.items() if d < least]
     fence = config.geofence
     if fence is not None:
@@ -267,64 +250,12 @@ def _change(config: FleetConfig, heard: Mapping[int, PreflightReport]) -> Iterat
     if any(a.revision > 0 for a in heard.values()):
         return  # it has been flown
     least = _separation_m(config)
-    motion = first_formation(config, config.first_motion)
-    pairs = change_distances_m(motion)
+    pairs = change_distances_m(config.first_formation)
     crossing = [f"vehicle {i} and {j} come within {d:.2f} m" for (i, j), d in pairs.items() if d < least]
     yield Check(
         "ways to the slots", tidy(min(pairs.values(), default=inf)), f">= {least:.2f} m apart", not crossing,
         f"{'; '.join(crossing)} on their ways to {config.formation.shape!r}; must be {least:.2f} m", permanent=True,
     )  # fmt: skip
-
-
-def change_distances_m(motion: FleetTrajectory) -> dict[tuple[int, int], float]:
-    """Least distance of every pair during a change of formation, exact.
-
-    All slots blend by one polynomial of time, so that a pair's offset goes straight from before to after; distances
-    above each other count by the downwash's ratio.
-    """
-    found = {}
-    for (i, a), (j, b) in combinations(motion.slots.items(), 2):
-        before = [x - y for x, y in zip(a.before, b.before, strict=True)]
-        after = [x - y for x, y in zip(a.after, b.after, strict=True)]
-        found[i, j] = _nearest_to_zero(_squeezed(before), _squeezed(after))
-    return found
-
-
-def _squeezed(offset: list[float]) -> Ned:
-    return Ned(offset[0], offset[1], offset[2] / DOWNWASH_RATIO)
-
-
-def _nearest_to_zero(p: Ned, q: Ned) -> float:
-    """Distance of the segment from p to q to the zero point."""
-    way = [b - a for a, b in zip(p, q, strict=True)]
-    length = sum(w * w for w in way)
-    t = 0.0 if length == 0.0 else min(max(-sum(a * w for a, w in zip(p, way, strict=True)) / length, 0.0), 1.0)
-    return sqrt(sum((a + t * w) ** 2 for a, w in zip(p, way, strict=True)))
-
-
-_Place = tuple[float, float, float] | Ned
-
-
-def _level(p: _Place, q: _Place) -> float:
-    return hypot(p[0] - q[0], p[1] - q[1])
-
-
-def _ways_apart(a0: _Place, a1: _Place, b0: _Place, b1: _Place) -> float:
-    """Least level distance between two straight ways."""
-    if _cross(a0, a1, b0, b1):
-        return 0.0
-    return min(_to_way(a0, b0, b1), _to_way(a1, b0, b1), _to_way(b0, a0, a1), _to_way(b1, a0, a1))
-
-
-def _to_way(p: _Place, a: _Place, b: _Place) -> float:
-    return _nearest_to_zero(Ned(a[0] - p[0], a[1] - p[1], 0.0), Ned(b[0] - p[0], b[1] - p[1], 0.0))
-
-
-def _cross(a0: _Place, a1: _Place, b0: _Place, b1: _Place) -> bool:
-    def side(p: _Place, q: _Place, r: _Place) -> float:
-        return (q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0])
-
-    return side(a0, a1, b0) * side(a0, a1, b1) < 0 and side(b0, b1, a0) * side(b0, b1, a1) < 0
 
 
 def _plan(config: FleetConfig) -> Iterator[Check]:

@@ -10,7 +10,6 @@ the part that does it: `observer`, `supervisor`, `peers`, `plans`, `publisher`, 
 from collections.abc import Sequence
 from math import dist
 from random import Random
-from typing import Any
 
 from companion.config import FleetConfig
 from companion.core.counts import Counts
@@ -18,7 +17,7 @@ from companion.core.events import FailsafeNoted
 from companion.core.failsafe import LATE_S, Failsafe
 from companion.core.frames import Ned
 from companion.core.law.starling import Law, StarlingLaw
-from companion.core.neighbours import PeerTable
+from companion.core.neighbours.table import PeerTable
 from companion.core.safety.filter import SafetyFilter
 from companion.core.trajectory.fleet import Reference, TrajectoryState
 from companion.core.trajectory.history import TrajectoryHistory
@@ -35,7 +34,8 @@ from companion.core.values import (
 )
 from companion.errors import WireError
 from companion.vehicle import operator_port, plan_exchange
-from companion.vehicle.autopilot.px4 import Heard, Px4Autopilot
+from companion.vehicle.autopilot.port import AutopilotPort, Heard
+from companion.vehicle.autopilot.px4 import Px4Autopilot
 from companion.vehicle.observer import StateObserver
 from companion.vehicle.operator_port import Activity, OperatorPort
 from companion.vehicle.orders import OrderBook
@@ -43,6 +43,7 @@ from companion.vehicle.outputs import Outputs, TickReport
 from companion.vehicle.plan_exchange import PlanExchange
 from companion.vehicle.publisher import OwnState, Publisher
 from companion.vehicle.supervisor import Supervisor
+from companion.wire.operator import Status
 from companion.wire.peer import WIRE_FAULTS, decode_state
 
 TIMER_SLACK = 2.5
@@ -71,15 +72,14 @@ class Agent:
         self.rejected = Counts(REJECTED)
         others = frozenset(v.id for v in config.vehicles) - {vehicle_id}
         random = Random(vehicle_id << 32 | boot_id)
-        origin = config.origin if config.fleet.frame == "global" else None
-        self.autopilot = Px4Autopilot(self.vehicle.system_id, origin, config.limits.control_rate_hz)
+        self.autopilot: AutopilotPort = Px4Autopilot(config, self.vehicle)
         self.history = TrajectoryHistory([config.first_motion])
         self.peers = PeerTable(vehicle_id, others, config.peer_limits, self.history)
         self.law: Law = StarlingLaw(config.gains)
         """what is flown, before the filter; tests and studies may put another in its place"""
         self.safety = SafetyFilter(config.safety_limits)
         self.observer = StateObserver()
-        self.supervisor = Supervisor(config, vehicle_id, self.autopilot, self.history, self.peers, self._restart_filter)
+        self.supervisor = Supervisor(config, self.autopilot, self.history, self.peers, self._restart_filter)
         self.publisher = Publisher(config, vehicle_id, boot_id, self.history, self.peers, random)
         self.plans = PlanExchange(
             config, vehicle_id, self.history, self.peers, self.supervisor, self.publisher, random, self.rejected
@@ -97,7 +97,7 @@ class Agent:
         """when this agent first acted (monotonic)"""
         self._ticked_ns: int | None = None
         """when the last control tick was (monotonic)"""
-        self._report: TickReport | None = None
+        self._last_tick: TickReport | None = None
         self._neighbours: list[Neighbour] = []
         self._predict_ns = 0
         """when who does not steer predicts its peers again (monotonic)"""
@@ -184,10 +184,10 @@ class Agent:
         """The process is asked to end: land. `stopped` tells when the autopilot has taken over."""
         self.supervisor.land(now)
 
-    def status(self, now: Instant) -> dict[str, Any]:
-        """What the operator's table shows; plain values."""
+    def status(self, now: Instant) -> Status:
+        """This vehicle's account of itself, but for what only its process knows."""
         up_s = 0.0 if self._began_ns is None else (now.monotonic_ns - self._began_ns) * 1e-9
-        return self.operator.status(Activity(up_s, self.setpoints_sent, self._report, dict(self.safety.counts)), now)
+        return self.operator.status(Activity(up_s, self.setpoints_sent, self._last_tick, dict(self.safety.counts)), now)
 
     # -- time ----------------------------------------------------------------------------------------------------------
 
@@ -239,7 +239,7 @@ class Agent:
         self.supervisor.settle(ego, reference, now)
         self.plans.propose(now)
         self._publish(reference, residual, now)
-        self._account(ego, reference, neighbours, came, setpoint is not None, now)
+        self._report_tick(ego, reference, neighbours, came, setpoint is not None, now)
 
     # -- the stages ----------------------------------------------------------------------------------------------------
 
@@ -304,12 +304,12 @@ class Agent:
         if self.publisher.announces and self.observer.observed_ns is not None:
             self._publish(self.history.reference(self.id, now.fleet_ns), ZERO, now)
 
-    def _account(
+    def _report_tick(
         self, ego: VehicleState, reference: Reference, neighbours: Sequence[Neighbour], came: bool, steered: bool,
         now: Instant,
     ) -> None:  # fmt: skip
         """Report what this tick did."""
-        self._report = self._outputs.tick = TickReport(
+        self._last_tick = self._outputs.tick = TickReport(
             now,
             came,
             dist(ego.position_ned_m, reference.position_ned_m),

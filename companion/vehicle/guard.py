@@ -11,7 +11,6 @@ patience (COM_OF_LOSS_T, 1 s) is over, and the autopilot's failsafe for lost set
 landing from here would take the very agent that fails.
 """
 
-import json
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -21,8 +20,9 @@ from typing import TypeVar
 from companion.core.failsafe import Failsafe
 from companion.core.values import Instant
 from companion.vehicle.agent import Agent
-from companion.vehicle.autopilot.px4 import NOTHING, Heard
+from companion.vehicle.autopilot.port import NOTHING, Heard
 from companion.vehicle.outputs import Outputs
+from companion.wire.operator import Answer, encode
 
 T = TypeVar("T")
 ADVANCE_LIMIT_S = 0.5
@@ -72,7 +72,7 @@ class Guard:
     def receive_command(self, payload: bytes, now: Instant) -> bytes:
         """`Agent.receive_command`; one that raised is answered as refused."""
         reason = "it failed in this vehicle: see `rejected` in its status"
-        refused = json.dumps({"vehicle": self.agent.id, "accepted": False, "reason": reason}).encode()
+        refused = encode(Answer(vehicle=self.agent.id, accepted=False, reason=reason))
         return self._guarded("command", lambda: self.agent.receive_command(payload, now), refused)
 
     def notice(self, failsafe: Failsafe, now: Instant) -> None:

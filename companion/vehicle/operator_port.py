@@ -1,23 +1,34 @@
 """What an operator asks of one vehicle: commands with their answers, its own preflight, its status."""
 
-import json
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from companion.config import FleetConfig
 from companion.core.counts import Counts, Refusal
 from companion.core.frames import Ned, geodetic_to_ned
-from companion.core.neighbours import PeerTable
+from companion.core.neighbours.table import PeerTable
 from companion.core.trajectory.history import TrajectoryHistory
 from companion.core.values import FLYING_PHASES, Instant, Phase
-from companion.vehicle.autopilot.px4 import Px4Autopilot
-from companion.vehicle.orders import ORDER_FAULTS, Order, OrderBook, Place, read_order
+from companion.errors import WireError
+from companion.vehicle.autopilot.port import AutopilotPort
+from companion.vehicle.orders import ORDER_FAULTS, OrderBook
 from companion.vehicle.outputs import TickReport
 from companion.vehicle.plan_exchange import PlanExchange
-from companion.vehicle.preflight import Check, PreflightReport, assignment_hash, own_checks, unmet
+from companion.vehicle.preflight import own_checks
 from companion.vehicle.publisher import Publisher
 from companion.vehicle.supervisor import Supervisor
-from companion.wire.peer import encode_motion
+from companion.wire.operator import (
+    Answer,
+    Check,
+    Command,
+    Place,
+    PreflightReport,
+    Status,
+    decode_command,
+    encode,
+    unmet,
+)
+from companion.wire.peer import motion_to_json
 
 FAILSAFES_SHOWN_MAX = 20
 """the last ones stand in a status: one that comes again and again must not make it too large to be sent"""
@@ -44,7 +55,7 @@ class OperatorPort:
     config: FleetConfig
     vehicle_id: int
     boot_id: int
-    autopilot: Px4Autopilot
+    autopilot: AutopilotPort
     supervisor: Supervisor
     history: TrajectoryHistory
     peers: PeerTable
@@ -52,8 +63,6 @@ class OperatorPort:
     publisher: Publisher
     rejected: Counts
     orders: OrderBook
-    _assignment: str | None = None
-    """hash of the first formation's assignment, once asked for"""
 
     @property
     def place(self) -> Place:
@@ -67,22 +76,24 @@ class OperatorPort:
         again = self.orders.answer_again(payload)
         if again is not None:
             return again
-        order = read_order(payload, self.vehicle_id)
-        if isinstance(order, Refusal):
-            return self._refuse(order)
-        refusal = self.orders.refusal(order, self.supervisor.begun)
+        try:
+            command = decode_command(payload)
+        except WireError as fault:
+            return self._refuse(Refusal(fault.kind, fault.detail))
+        places = command.after.get(self.vehicle_id, ())
+        refusal = self.orders.refusal(command.verb, places, self.supervisor.begun)
         if refusal is not None:
             return self._refuse(refusal, in_order=False)
-        reason = self._obey(order, now)
+        reason = self._obey(command, now)
         if reason is None:
-            self.orders.obeyed_now(order)
+            self.orders.obeyed_now(command)
         answer = self._answer(reason)
         self.orders.answered(payload, answer)
         return answer
 
-    def _obey(self, order: Order, now: Instant) -> str | None:
+    def _obey(self, command: Command, now: Instant) -> str | None:
         """Do what is commanded; returns why not."""
-        match order.verb:
+        match command.verb:
             case "takeoff":
                 return self._take_off(now)
             case "land":
@@ -92,9 +103,8 @@ class OperatorPort:
             case "resume":
                 return self.supervisor.resume(now)
             case "kill":
-                confirmed = order.fields.get("confirm") is True
-                return self.supervisor.kill(now) if confirmed else "kill needs its confirmation"
-        return self.plans.on_command(order.fields.get("motion"), now)
+                return self.supervisor.kill(now) if command.confirm else "kill needs its confirmation"
+        return self.plans.on_command(command.motion, now)
 
     def _take_off(self, now: Instant) -> str | None:
         phase, newest = self.supervisor.phase, self.history.newest
@@ -112,16 +122,17 @@ class OperatorPort:
         return self._answer(refusal.sentence, in_order)
 
     def _answer(self, refusal: str | None, in_order: bool = True) -> bytes:
-        answer = {
-            "vehicle": self.vehicle_id,
-            "accepted": refusal is None,
-            "reason": refusal,
-            "phase": self.supervisor.phase.name.lower(),
-            "in_order": in_order,
-            "revision": self.history.newest.revision,
-            "place": [*self.place],
-        }
-        return json.dumps(answer).encode()
+        return encode(
+            Answer(
+                vehicle=self.vehicle_id,
+                accepted=refusal is None,
+                reason=refusal,
+                phase=self.supervisor.phase.name.lower(),
+                in_order=in_order,
+                revision=self.history.newest.revision,
+                place=self.place,
+            )
+        )
 
     # -- preflight -----------------------------------------------------------------------------------------------------
 
@@ -154,15 +165,13 @@ class OperatorPort:
     def preflight_report(self, now: Instant) -> PreflightReport:
         """The answer to a preflight question."""
         facts = self.autopilot.facts(now)
-        if self._assignment is None:
-            self._assignment = assignment_hash(self.config)
         origin = None if facts.origin is None else geodetic_to_ned(facts.origin, self.config.origin)
         return PreflightReport(
             vehicle=self.vehicle_id,
             boot_id=self.boot_id,
             system_id=self.config.by_id(self.vehicle_id).system_id,
             configuration=self.config.shared_hash,
-            assignment=self._assignment,
+            assignment=self.config.assignment_hash,
             flying=self.supervisor.phase in FLYING_PHASES,
             revision=self.history.newest.revision,
             position_ned_m=facts.position_ned_m,
@@ -175,37 +184,38 @@ class OperatorPort:
 
     # -- status --------------------------------------------------------------------------------------------------------
 
-    def status(self, activity: Activity, now: Instant) -> dict[str, Any]:
-        """What the operator's table shows, as plain values."""
+    def status(self, activity: Activity, now: Instant) -> Status:
+        """This vehicle's account of itself, but for what only its process knows."""
         tick = activity.tick
         unready, newest = unmet(self.checks(now)), self.history.newest
         rejected = self.rejected + self.supervisor.counts + self.peers.rejected
-        return {
-            "vehicle": self.vehicle_id,
-            "phase": self.supervisor.phase.name.lower(),
-            "mode": self.autopilot.mode_name,
-            "killed": None if self.supervisor.killed is None else self.supervisor.killed.value,
-            "armed": self.autopilot.armed,
-            "ready": [c.message for c in unready],
-            "unfit": [c.message for c in unready if c.permanent],
-            "revision": newest.revision,
-            "fleet": self.config.fleet.name,
-            "up_s": activity.up_s,
-            "place": [*self.place],
-            "shape": newest.shape,
-            "moving": newest.end_ns is None or bool(newest.legs),
-            "position_error_m": tick.position_error_m if tick else None,
-            "neighbours": tick.neighbours if tick else 0,
-            "nearest_m": tick.nearest_m if tick and tick.nearest_m >= 0 else None,
-            "oldest_age_s": self.peers.oldest_age_s(now),
-            "messages": self.publisher.messages_sent,
-            "messages_by_cause": dict(self.publisher.sent_because),
-            "setpoints": activity.setpoints_sent,
-            "battery_percent": self.autopilot.battery(now),
-            "autopilot_age_s": self.autopilot.heartbeat_age_s(now),
-            "configuration": self.config.shared_hash,
-            "failsafes": self.supervisor.failsafes[-FAILSAFES_SHOWN_MAX:],
-            "rejected": dict(rejected + self.autopilot.rejected),
-            "limited": activity.limited,
-            "motion": json.loads(encode_motion(newest)),
-        }
+        return Status(
+            vehicle=self.vehicle_id,
+            phase=self.supervisor.phase.name.lower(),
+            mode=self.autopilot.mode_name,
+            killed=None if self.supervisor.killed is None else self.supervisor.killed.value,
+            armed=self.autopilot.armed,
+            ready=[c.message for c in unready],
+            unfit=[c.message for c in unready if c.permanent],
+            revision=newest.revision,
+            fleet=self.config.fleet.name,
+            up_s=activity.up_s,
+            place=self.place,
+            shape=newest.shape,
+            moving=newest.end_ns is None or bool(newest.legs),
+            position_error_m=tick.position_error_m if tick else None,
+            neighbours=tick.neighbours if tick else 0,
+            nearest_m=tick.nearest_m if tick and tick.nearest_m >= 0 else None,
+            oldest_age_s=self.peers.oldest_age_s(now),
+            messages=self.publisher.messages_sent,
+            messages_by_cause=dict(self.publisher.sent_because),
+            setpoints=activity.setpoints_sent,
+            battery_percent=self.autopilot.battery(now),
+            autopilot_age_s=self.autopilot.heartbeat_age_s(now),
+            configuration=self.config.shared_hash,
+            failsafes=self.supervisor.failsafes[-FAILSAFES_SHOWN_MAX:],
+            rejected=dict(rejected + self.autopilot.rejected),
+            limited=activity.limited,
+            own_id_heard=self.publisher.own_id_heard(now),
+            motion=motion_to_json(newest),
+        )

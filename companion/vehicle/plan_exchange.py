@@ -5,7 +5,6 @@ Trajectories are ordered (`FleetTrajectory.order`) and every vehicle keeps the l
 all come to the same one, in whatever order they hear of several.
 """
 
-import json
 from enum import Enum, unique
 from math import dist
 from random import Random
@@ -14,17 +13,16 @@ from companion.config import FleetConfig
 from companion.core.budget import Bucket, ExaminationBudget
 from companion.core.counts import Counts, RefusalKind
 from companion.core.events import Event, MotionAdopted
-from companion.core.neighbours import PeerTable
+from companion.core.neighbours.table import PeerTable
 from companion.core.trajectory.fleet import PADS, FleetTrajectory, motion_order
 from companion.core.trajectory.history import TrajectoryHistory
 from companion.core.trajectory.successors import assignment_matches, over_the_pads, with_legs
-from companion.core.trajectory_check import Fault, examine
+from companion.core.trajectory_check import Fault, examine, revision_fault
 from companion.core.values import FILTERED_PHASES, SETTLED_PHASES, Instant, PeerMessage, Phase
 from companion.errors import ConfigError, WireError
-from companion.vehicle.orders import revision_fault
 from companion.vehicle.publisher import Publisher, spread_ns
 from companion.vehicle.supervisor import Supervisor
-from companion.wire.peer import WIRE_FAULTS, decode_motion, encode_motion
+from companion.wire.peer import WIRE_FAULTS, decode_motion, encode_motion, motion_from_json
 
 PROPOSAL_DELAY_NS = 3_000_000_000
 """how far ahead a vehicle proposes a start that follows by itself"""
@@ -117,7 +115,7 @@ class PlanExchange:
             self._rejected["command: more than can be examined"] += 1
             return "too many motions at once: command it again"
         try:
-            trajectory = decode_motion(json.dumps(motion).encode())
+            trajectory = motion_from_json(motion)
         except WireError as error:
             self._rejected["command: motion"] += 1
             return str(error)

@@ -13,7 +13,8 @@ from typing import NamedTuple
 from companion.config import FleetConfig
 from companion.core.frames import Ned
 from companion.core.near import PUSH_M_S2, NearMode, near_push_m_s2
-from companion.core.neighbours import PeerTable, predict_sample
+from companion.core.neighbours.sample import predict_sample
+from companion.core.neighbours.table import PeerTable
 from companion.core.safety.filter import HalfPlane, push_m_s2
 from companion.core.trajectory.fleet import Reference
 from companion.core.trajectory.history import TrajectoryHistory

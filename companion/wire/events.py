@@ -13,7 +13,7 @@ from companion.core import events
 from companion.core.events import Event
 from companion.core.trajectory.fleet import FleetTrajectory
 from companion.errors import WireError
-from companion.wire.peer import decode_motion, encode_motion
+from companion.wire.peer import motion_from_json, motion_to_json
 
 KINDS: dict[str, type[Event]] = {
     "phase": events.PhaseChanged,
@@ -56,7 +56,7 @@ def _as_json(value: Any) -> Any:
         case Enum():
             return value.name.lower()
         case FleetTrajectory():
-            return json.loads(encode_motion(value))
+            return motion_to_json(value)
     return value
 
 
@@ -64,7 +64,7 @@ def _from_json(type_: type, value: Any) -> Any:
     if issubclass(type_, Enum):
         return type_[value.upper()] if isinstance(value, str) else type_(value)
     if type_ is FleetTrajectory:
-        return decode_motion(json.dumps(value).encode())
+        return motion_from_json(value)
     if type(value) is not type_:
         raise TypeError(f"{value!r:.60} is no {type_.__name__}")
     return value

@@ -13,7 +13,7 @@ import json
 import struct
 from itertools import pairwise
 from math import isfinite
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -179,6 +179,21 @@ def encode_motion(motion: FleetTrajectory) -> bytes:
                 legs.append({"kind": leg.kind, "target_ned_m": leg.target_ned_m, "duration_s": leg.duration_s})
     fields = {name: getattr(motion, name) for name in _Motion.model_fields if name not in ("version", "legs")}
     return json.dumps({"version": VERSION, **fields, "legs": legs}, separators=(",", ":")).encode()
+
+
+def motion_to_json(motion: FleetTrajectory) -> dict[str, Any]:
+    """A motion as plain values, to stand inside of other JSON."""
+    plain: dict[str, Any] = json.loads(encode_motion(motion))
+    return plain
+
+
+def motion_from_json(plain: object) -> FleetTrajectory:
+    """`motion_to_json`, read again; WireError as `decode_motion`."""
+    try:
+        payload = json.dumps(plain).encode()
+    except (ValueError, TypeError, RecursionError) as error:
+        raise WireError("motion", str(error)[:160]) from None
+    return decode_motion(payload)
 
 
 def decode_motion(payload: bytes) -> FleetTrajectory:

@@ -35,7 +35,7 @@ CROWD_NICENESS = 10
 """more companions than CROWD want more than two processors: they get less, each its share, and not the one process that
 simulates all autopilots, without which nobody flies"""
 AUTOPILOTS_GRACE_S = 12.0
-LIBRARIES = ("starling-fleet", "pymavlink", "eclipse-zenoh", "numpy", "scipy", "pydantic", "mcap")
+LIBRARIES = ("starling-fleet", "pymavlink", "eclipse-zenoh", "numpy", "pydantic", "mcap")
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,12 +213,12 @@ class _Launch:
             centroid_limit_m=0.5 if options.px4 is None else 1.0,
             lost=lost,
             autopilots_lost=autopilots_lost,
-            disarmed={i: not said["armed"] for i, said in watch.said.items()},
+            disarmed={i: not said.armed for i, said in watch.said.items()},
             versions={"python": sys.version.split()[0], **{name: version(name) for name in LIBRARIES}},
         )
         for i in watch.ids:
             flight.read_file(i, self._recording(i))
-            flight.rejected += Counter(watch.said[i]["rejected"] if i in watch.said else {})
+            flight.rejected += Counter(watch.said[i].rejected if i in watch.said else {})
         rows = read_reference_loop(options.folder / "reference.bin")
         flight.reference_lateness_ns = rows[rows[:, 0] >= watch.asked_ns, 1].astype(float)
         summary = {

@@ -25,7 +25,7 @@ FLEET_PARAMETERS: Mapping[str, float | int] = {
     "COM_RCL_EXCEPT": 4,
     "SDLOG_MODE": -1,
 }
-"""a fleet without RC: land when the setpoints end; no stick input; no log on disk. Of `preflight.ALTERNATIVES` a
+"""a fleet without RC: land when the setpoints end; no stick input; no log on disk. Of `px4_versions.RENAMED` a
 version has one"""
 SIMULATOR_PARAMETERS: Mapping[str, float | int] = {"EKF2_ACC_NOISE": 0.6, "EKF2_GYR_NOISE": 0.1}
 """what SIH's sensors are like: in flight their white noise is 0.5, 1.7 and 1.4 m/s^2 and 0.14, 0.07 and 0.03 rad/s a

@@ -24,7 +24,7 @@ from companion.config.derived import Vehicle
 from companion.core.frames import Geodetic, Ned, geodetic_to_ned, ned_to_geodetic
 from companion.errors import CompanionError
 from companion.io.link import SO_TIMESTAMPNS, received_unix_ns
-from companion.vehicle.preflight import same_setting
+from companion.vehicle.autopilot.px4_versions import same_setting
 from companion.wire.mavlink import dialect as mavlink
 from companion.wire.mavlink import interval_parameters, parameter_value
 from sim.autopilot.stubs import TRUTH_DTYPE

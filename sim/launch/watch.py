@@ -4,10 +4,10 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from companion.errors import CompanionError
 from companion.operator.client import Answers, Operator, PreflightError
+from companion.wire.operator import Status
 from sim.launch.ended import read_ended
 from sim.launch.faults import ScheduledFault, order_fault
 from sim.launch.processes import FleetProcesses
@@ -24,7 +24,7 @@ TAKE_OFF_GRACE_S = 15.0
 UNHEARD_S = 15.0
 """an autopilot silent for so long will not tell of its landing any more"""
 
-Said = Mapping[int, Mapping[str, Any] | None]
+Said = Mapping[int, Status | None]
 
 
 class MissingError(CompanionError):
@@ -63,7 +63,7 @@ class Watch:
     allow_missing: bool = False
     tell: Callable[[str], None] = lambda _: None
     """says what cannot wait for the live table, once"""
-    said: dict[int, dict[str, Any]] = field(default_factory=dict)
+    said: dict[int, Status] = field(default_factory=dict)
     """each vehicle's last account"""
     asked_ns: int = 0
     """when the take-off was last commanded (UTC)"""
@@ -73,7 +73,7 @@ class Watch:
     """when the companions were there to be asked first"""
     _told_missing: dict[int, str] = field(default_factory=dict)
 
-    def _look(self, doing: str) -> dict[int, dict[str, Any] | None]:
+    def _look(self, doing: str) -> dict[int, Status | None]:
         answers = self.operator.status()
         self.said.update({i: s for i, s in answers.items() if s is not None})
         self.show(Progress(self.clock() - self.began, doing, answers, self.ended(), self.autopilots_ended()))
@@ -123,12 +123,12 @@ class Watch:
             self._refuse_ended()
             answers = self._look("starting")
             self._name_missing(answers)
-            if self._parametrised and all(s is not None and not s["ready"] for s in answers.values()):
+            if self._parametrised and all(s is not None and not s.ready for s in answers.values()):
                 return
             if interrupted():
                 raise CompanionError("interrupted before take-off")
             # Once all speak, so that all are named; seen twice, since what comes in at the start has no order.
-            unfit = all(s is not None for s in answers.values()) and any(s["unfit"] for s in answers.values() if s)
+            unfit = all(s is not None for s in answers.values()) and any(s.unfit for s in answers.values() if s)
             if (unfit and unfit_before) or self.clock() > deadline:
                 return
             unfit_before = unfit
@@ -178,7 +178,7 @@ class Watch:
                 raise CompanionError(self.processes.why_ended("autopilots", "in flight"))
             tried = self.clock() - start > TAKE_OFF_GRACE_S
             down = ("landed", "released", "idle") if tried else ("landed", "released")
-            done = [(s["phase"] in down and not s["armed"]) or _unheard(s) for s in staying]
+            done = [(s.phase in down and not s.armed) or _unheard(s) for s in staying]
             if staying and all(done) and len(staying) + len(gone & frozenset(self.ids)) == len(self.ids):
                 return lost
             while coming and self.clock() - start >= coming[0].at_s:
@@ -193,14 +193,13 @@ class Watch:
             self.sleep(POLL_S)
 
 
-def _absence(status: Mapping[str, Any] | None) -> str | None:
+def _absence(status: Status | None) -> str | None:
     """Why a vehicle has not come; None if it has."""
     if status is None:
         return "its companion does not answer"
-    return "its autopilot is not heard" if status.get("autopilot_age_s", 0.0) is None else None
+    return "its autopilot is not heard" if status.autopilot_age_s is None else None
 
 
-def _unheard(status: Mapping[str, Any]) -> bool:
+def _unheard(status: Status) -> bool:
     """Whether a vehicle's autopilot has said nothing for so long that nobody need wait for it to land."""
-    age_s = status.get("autopilot_age_s")
-    return age_s is not None and age_s > UNHEARD_S
+    return status.autopilot_age_s is not None and status.autopilot_age_s > UNHEARD_S

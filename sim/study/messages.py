@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from companion.config import FleetConfig, load
-from companion.core.monitor import minimum_distance_m
 from companion.core.values import Phase
 from companion.errors import ConfigError
 from companion.vehicle.publisher import CAUSES
 from sim.lockstep.lockstep import Lockstep
 from sim.lockstep.network import NetworkParameters
+from sim.measures import minimum_distance_m
 from sim.study.common import FLYING_CODE, Column, Config, Outcome, Record, Table, table_of
 from sim.study.never_near import NeverNear
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from companion.core.monitor import algebraic_connectivity
+from sim.measures import algebraic_connectivity
 from sim.study.common import Column, Config, Figure, Outcome, Record, Table, proportion_interval, statistics
 from sim.study.figures import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, panels
 from sim.swarm.swarm import Run, Setup, run, setup_from

@@ -18,13 +18,14 @@ import numpy as np
 import numpy.typing as npt
 from numba import config as numba_config
 
-from companion.core import estimate, neighbours, trigger, vectors
+from companion.core import estimate, trigger, vectors
 from companion.core import prediction as hold
 from companion.core.frames import Ned
 from companion.core.law import consensus, intent
 from companion.core.law import starling as law
 from companion.core.law.intent import IntentGains, IntentTrigger
 from companion.core.law.starling import Gains, Sums
+from companion.core.neighbours import gates
 from companion.core.prediction import Weights
 from companion.core.safety import filter as safety
 from companion.core.safety import program
@@ -37,7 +38,7 @@ Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.uint8]
 F = TypeVar("F", bound=Callable[..., Any])
 
-_MODULES = (baselines, consensus, estimate, hold, intent, law, neighbours, program, safety, trigger, vectors)
+_MODULES = (baselines, consensus, estimate, hold, gates, intent, law, program, safety, trigger, vectors)
 
 
 def source_hash() -> str:
@@ -91,7 +92,7 @@ closest_point_parameter = compiled(vectors.closest_point_parameter)
 avoid: Callable[[float, float, float, float, Floats, int, int, float, Floats], safety.Avoidance] = compiled(
     cast(Any, safety.avoid), sidestep=sidestep, solve=solve
 )
-is_outlier = compiled(neighbours.is_outlier)
+is_outlier = compiled(gates.is_outlier)
 saturated = compiled(consensus.saturated)
 common_velocity_rate = compiled(consensus.common_velocity_rate)
 anchor_rate = compiled(intent.anchor_rate, saturated=saturated)

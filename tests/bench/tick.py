@@ -8,6 +8,7 @@ again in a process of its own, as fast as it can, and each tick in formation is 
 position and `advance` after it. The trees' outputs are compared too.
 """
 
+import importlib
 import os
 import pickle
 import statistics
@@ -49,9 +50,15 @@ def tables() -> dict[str, Any]:
     return read
 
 
+def fleet() -> Any:
+    """That fleet as the tree that is imported reads it; trees differ in where they have the reader."""
+    config = importlib.import_module("companion.config")
+    reader = config if hasattr(config, "parse") else importlib.import_module("companion.config.file")
+    return reader.parse(tables(), "tick")
+
+
 def flight() -> list[tuple[str, int, int, bytes]]:
     """What one vehicle met: (channel, monotonic ns, fleet ns, body)."""
-    from companion.config.file import parse
     from sim.lockstep.lockstep import Lockstep
 
     met: list[tuple[str, int, int, bytes]] = []
@@ -60,22 +67,21 @@ def flight() -> list[tuple[str, int, int, bytes]]:
         if i == VEHICLE and not channel.startswith("output/"):
             met.append((channel, now.monotonic_ns, now.fleet_ns, body))
 
-    fleet = Lockstep(parse(tables(), "tick"), seed=1, record=record)
-    fleet.run_until(READY_S, lambda: not any(v.agent.operator.unready(fleet.now) for v in fleet.vehicles.values()))
-    fleet.command(b'{"verb":"takeoff"}')
-    fleet.run_until(fleet.now_ns * 1e-9 + FLIGHT_S)
-    boot_id = fleet.vehicles[VEHICLE].agent.boot_id
+    ls = Lockstep(fleet(), seed=1, record=record)
+    ls.run_until(READY_S, lambda: not any(v.agent.operator.unready(ls.now) for v in ls.vehicles.values()))
+    ls.command(b'{"verb":"takeoff"}')
+    ls.run_until(ls.now_ns * 1e-9 + FLIGHT_S)
+    boot_id = ls.vehicles[VEHICLE].agent.boot_id
     return [("boot", boot_id, 0, b""), *met]
 
 
 def meet(tape: Path) -> Met:
     """The recorded flight, met by the agent that this process imports."""
-    from companion.config.file import parse
     from companion.core.values import FORMATION_PHASES, Instant
     from companion.vehicle.agent import Agent
 
     (_, boot_id, _, _), *entries = pickle.loads(tape.read_bytes())
-    agent = Agent(parse(tables(), "tick"), VEHICLE, boot_id)
+    agent = Agent(fleet(), VEHICLE, boot_id)
     digest = blake2b(digest_size=12)
     took: list[int] = []
     received_ns = 0

@@ -16,6 +16,7 @@ from companion.config import FleetConfig, load
 from companion.core.trajectory.history import TrajectoryHistory
 from companion.core.values import Instant, Phase
 from companion.io.recorder import Entry
+from companion.wire.operator import encode
 from sim.lockstep.lockstep import UTC_AT_START_NS, Lockstep
 from sim.lockstep.network import NetworkParameters
 
@@ -206,9 +207,7 @@ class InLockstep:
         if kind == "command":
             answers = self.ls.command(payload, *vehicle_ids)
         else:
-            answers = {
-                i: json.dumps(v.agent.status(self.ls.now)).encode() for i, v in self.ls.vehicles.items() if v.alive
-            }
+            answers = {i: encode(v.agent.status(self.ls.now)) for i, v in self.ls.vehicles.items() if v.alive}
         return {i: (answers[i],) if i in answers else () for i in vehicle_ids}
 
     def wait(self, seconds: float) -> None:

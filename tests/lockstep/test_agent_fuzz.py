@@ -22,6 +22,7 @@ from companion.core.frames import Ned
 from companion.core.values import Instant, PeerMessage, PeerSample, Phase
 from companion.errors import WireError
 from companion.vehicle.agent import Agent
+from companion.wire.operator import encode
 from companion.wire.peer import VERSION, decode_motion, decode_state, encode_motion, encode_state
 from sim.lockstep.lockstep import UTC_AT_START_NS, Lockstep
 
@@ -209,10 +210,10 @@ def test_a_fleet_in_flight_survives_a_rain_of_nonsense_and_sends_none_itself() -
     assert sent > 1000
     for v in ls.vehicles.values():
         status = v.agent.status(ls.now)
-        assert sum(status["rejected"].values()) > 200
+        assert sum(status.rejected.values()) > 200
         # However much comes, what is counted are kinds, and a status stays a message that can be sent.
-        assert len(status["rejected"]) < 60
-        assert len(json.dumps(status)) < 20_000
+        assert len(status.rejected) < 60
+        assert len(encode(status)) < 20_000
 
 
 # -- what is refused leaves no trace -----------------------------------------------------------------------------------
@@ -281,7 +282,7 @@ def outputs(rain: bool) -> tuple[str, dict[str, int]]:
         for i in ls.vehicles if rain else ():
             refused(noise, ls, i)
     assert ls.all_in(Phase.FORMING)
-    return str(tape.digest.hexdigest()), ls.vehicles[1].agent.status(ls.now)["rejected"]
+    return str(tape.digest.hexdigest()), ls.vehicles[1].agent.status(ls.now).rejected
 
 
 def test_what_is_refused_is_counted_and_changes_not_one_bit_of_what_is_sent() -> None:
@@ -354,7 +355,7 @@ def test_any_order_of_events_leaves_an_agent_that_goes_on(events: list[tuple[str
             for datagram in agent.advance(now).mavlink:
                 parse(datagram)
                 check_setpoint(datagram, CONFIG)
-        json.dumps(agent.status(now))
+        encode(agent.status(now))
     assert agent.next_deadline_ns() <= now_ns + 1_100_000_000
 
 
@@ -389,9 +390,9 @@ def give(agent: Agent, given: Input, now: Instant) -> None:
         case "presence":
             agent.receive_presence(given.payload[0], bool(given.payload[1]), now)
         case "status":
-            assert len(json.dumps(agent.status(now))) < 40_000
+            assert len(encode(agent.status(now))) < 40_000
         case "preflight":
-            assert len(agent.operator.preflight_report(now).model_dump_json()) < 40_000
+            assert len(encode(agent.operator.preflight_report(now))) < 40_000
 
 
 def flooded(seed: int, count: int) -> tuple[int, int, int]:
@@ -417,7 +418,7 @@ def flooded(seed: int, count: int) -> tuple[int, int, int]:
                     give(v.agent, one, ls.now)
                 given, most = given + 1, max(most, calls.count)
     for v in ls.vehicles.values():
-        rejected = v.agent.status(ls.now)["rejected"]
+        rejected = v.agent.status(ls.now).rejected
         assert len(rejected) < 80, sorted(rejected)
     return given, through, most
 

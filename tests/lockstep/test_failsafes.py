@@ -25,8 +25,7 @@ from pymavlink.dialects.v20 import development as dialect
 from companion.core.failsafe import FAILSAFES, LATE_S, STATUS_S, UNCERTAIN_S, Action, Failsafe
 from companion.core.frames import Ned
 from companion.core.values import Instant, PeerMessage, Phase
-from companion.vehicle.autopilot.px4 import Px4Autopilot
-from companion.vehicle.supervisor import ON_GROUND
+from companion.vehicle.autopilot.px4 import ON_GROUND, Px4Autopilot
 from companion.wire.mavlink import Px4Mode, mode_parameters
 from companion.wire.peer import encode_state
 from sim.autopilot.faults import Fault, FaultKind
@@ -93,7 +92,7 @@ class Scene:
         return self.ls.vehicles[1].agent.phase
 
     def count(self, failsafe: Failsafe) -> int:
-        told = self.ls.vehicles[1].agent.status(self.ls.now)["rejected"]
+        told = self.ls.vehicles[1].agent.status(self.ls.now).rejected
         return int(told.get(failsafe.value, 0))
 
     def after(self, text: str) -> float:
@@ -484,7 +483,7 @@ def battery_unknown() -> tuple[float, float]:
     s.ls.vehicles[1].autopilot.inject(Fault(FaultKind.LOW_BATTERY, 0.5))
     wait(s.ls, 6.0)
     assert s.count(Failsafe.BATTERY_UNKNOWN) == 1
-    assert s.ls.vehicles[1].agent.status(s.ls.now)["battery_percent"] == -1
+    assert s.ls.vehicles[1].agent.status(s.ls.now).battery_percent == -1
     must_go_on(s, Phase.WAITING)
     return s.after(Failsafe.BATTERY_UNKNOWN.value), 5.0
 
@@ -548,7 +547,7 @@ def not_finite() -> tuple[float, float]:
     boot_ms = agent.autopilot.boot.last_boot_ms + 1
     message = dialect.MAVLink_local_position_ned_message(boot_ms, float("nan"), 0.0, 0.0, 0.0, 0.0, 0.0)
     agent.receive_mavlink(bytes(message.pack(WORLD)), s.ls.now)
-    assert agent.status(s.ls.now)["rejected"]["not finite"] == 1
+    assert agent.status(s.ls.now).rejected["not finite"] == 1
     must_go_on(s, Phase.WAITING)
     return 0.0, 0.0
 
@@ -615,7 +614,7 @@ def test_a_position_that_jumps_on_the_ground_is_no_failsafe_in_the_air(when: str
     s.tamper(49)
     s.inject(FaultKind.ESTIMATOR_RESET)
     wait(ls, 0.5)
-    assert s.ls.vehicles[1].agent.supervisor.positions.jumps == 1
+    assert s.ls.vehicles[1].agent.supervisor.flight.positions.jumps == 1
     s.tamper()
     if when == "disarmed":
         wait(ls, 2.0)

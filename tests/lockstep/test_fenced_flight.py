@@ -58,7 +58,7 @@ def test_a_broken_law_at_the_speed_limit_stays_inside_and_without_the_fence_it_l
     farthest = float(np.hypot(p[:, 0], p[:, 1]).max())
     if fence:
         assert RADIUS_M - 3.5 < farthest < RADIUS_M - 0.5
-        assert agent.status(ls.now)["limited"]["fence"] > 100
+        assert agent.status(ls.now).limited["fence"] > 100
     else:
         assert farthest > RADIUS_M + 20.0
 
@@ -87,6 +87,6 @@ def test_a_move_for_ever_ends_at_the_fence_one_up_is_refused_and_a_hold_never_is
     t = truth(ls, start_s)
     assert float(np.hypot(t.position_ned_m[..., 0], t.position_ned_m[..., 1]).max()) < RADIUS_M
     assert newest(ls).state_at(ls.now.fleet_ns).centre.position.north > RADIUS_M + 10.0
-    assert ls.vehicles[1].agent.status(ls.now)["limited"]["fence"] > 100
+    assert ls.vehicles[1].agent.status(ls.now).limited["fence"] > 100
     assert all(a["accepted"] for a in send(ls, moved(ls, VelocityLeg(ZERO, 0.0))))
     assert all(a["accepted"] for a in send(ls, moved(ls, GotoLeg(Ned(0.0, 0.0, -3.0), 60.0))))

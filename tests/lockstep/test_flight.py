@@ -27,6 +27,7 @@ from companion.config import FleetConfig
 from companion.core.values import Instant, Phase
 from companion.io.replay import replay
 from companion.vehicle.agent import Agent
+from companion.wire.operator import Status, decode, encode
 from companion.wire.peer import decode_motion, encode_motion
 from sim.launch.summary.flight import Flight, Put
 from sim.launch.summary.summarise import summarise
@@ -128,8 +129,8 @@ def test_every_setpoint_was_finite_and_within_limits_and_none_was_missed(ten: Re
 def test_a_flight_without_faults_counts_next_to_nothing_as_rejected(ten: Recorded) -> None:
     for v in ten.ls.vehicles.values():
         status = v.agent.status(ten.ls.now)
-        assert json.loads(json.dumps(status, allow_nan=False)) == status
-        assert not set(status["rejected"]) - {"refused: stream", "position repeated", "answer to nothing asked"}, status
+        assert decode(Status, encode(status)) == status
+        assert not set(status.rejected) - {"refused: stream", "position repeated", "answer to nothing asked"}, status
 
 
 def test_the_summary_says_what_the_true_states_say(ten: Recorded) -> None:

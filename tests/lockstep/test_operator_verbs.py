@@ -27,8 +27,8 @@ from companion.core.trajectory.successors import with_legs
 from companion.core.values import ZERO, Instant, Phase
 from companion.operator.client import Operator, velocity_leg
 from companion.vehicle.agent import Agent
-from companion.vehicle.orders import Place
 from companion.wire.mavlink import Px4Mode
+from companion.wire.operator import Place
 from companion.wire.peer import encode_motion
 from sim.lockstep.lockstep import Lockstep
 
@@ -54,7 +54,7 @@ def aloft(count: int, record: Any = None) -> tuple[Lockstep, Operator]:
 
 def place(ls: Lockstep, i: int = 1) -> Place:
     """Where a vehicle says to be in the order of its commands."""
-    return Place(*ls.vehicles[i].agent.status(ls.now)["place"])
+    return ls.vehicles[i].agent.status(ls.now).place
 
 
 def order(verb: str, name: str, *after: Place, **more: object) -> bytes:

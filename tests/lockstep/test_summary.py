@@ -256,7 +256,7 @@ def test_a_vehicle_killed_in_the_air_fails_the_flight_and_is_shown_as_killed(
     kill(f)
     until(f.ls, 20.0, lambda: f.ls.vehicles[3].agent.phase is Phase.LANDED)
     wait(f.ls, 3.0)
-    assert f.ls.vehicles[3].agent.status(f.ls.now)["killed"] == cause
+    assert f.ls.vehicles[3].agent.status(f.ls.now).killed == cause
     # Disarmed, its mode is OFFBOARD again, in which it was before.
     mine = f.rows[f.rows["vehicle_id"] == 3]
     assert (mine["custom_mode"][-1], mine["armed"][-1]) == (Px4Mode.OFFBOARD, 0)
@@ -276,7 +276,7 @@ def test_a_vehicle_that_is_killed_where_it_stands_disarmed_is_not_killed() -> No
     until_landed(f.ls)
     f.ls.command(b'{"verb":"kill","confirm":true}')
     wait(f.ls, 3.0)
-    assert f.ls.vehicles[1].agent.status(f.ls.now)["killed"] is None
+    assert f.ls.vehicles[1].agent.status(f.ls.now).killed is None
     assert check(f)["killed"] == {}
 
 
@@ -286,10 +286,10 @@ def test_a_vehicle_killed_as_it_takes_off_is_killed_until_its_next_take_off_and_
     f.ls.command(b'{"verb":"kill","confirm":true}')
     until(f.ls, 10.0, lambda: not f.ls.vehicles[1].autopilot.truth().armed and f.ls.all_in(Phase.LANDED, Phase.IDLE))
     wait(f.ls, 12.0)
-    assert f.ls.vehicles[1].agent.status(f.ls.now)["killed"] == "killed by command"
+    assert f.ls.vehicles[1].agent.status(f.ls.now).killed == "killed by command"
     assert json.loads(f.ls.command(b'{"verb":"takeoff"}')[1])["accepted"]
     wait(f.ls, 1.0)
-    assert f.ls.vehicles[1].agent.status(f.ls.now)["killed"] is None
+    assert f.ls.vehicles[1].agent.status(f.ls.now).killed is None
     until(f.ls, 60.0, lambda: f.ls.all_in(Phase.MOVING))
     until_landed(f.ls)
     summary = check(f)

@@ -25,6 +25,7 @@ from companion.config import FleetConfig, load
 from companion.io.network import operator_link
 from companion.io.zenoh.configuration import scouting_port
 from companion.operator.client import Operator
+from companion.wire.operator import Status, decode
 from sim.autopilot.stubs import TRUTH_DTYPE
 
 PORTS = range(26_000, 32_000, 100)
@@ -143,12 +144,9 @@ def operator_of(fleet: Fleet) -> Iterator[Operator]:
         yield Operator(fleet.config, link)
 
 
-Status = dict[int, dict[str, Any] | None]
-
-
 def wait_status(
-    operator: Operator, enough: Callable[[dict[int, dict[str, Any]]], bool], timeout_s: float = PATIENCE_S
-) -> dict[int, dict[str, Any]]:
+    operator: Operator, enough: Callable[[dict[int, Status]], bool], timeout_s: float = PATIENCE_S
+) -> dict[int, Status]:
     """Ask until what the vehicles say is enough; fails with their last words when the time is up."""
     deadline_s = time.monotonic() + timeout_s
     while True:
@@ -159,17 +157,17 @@ def wait_status(
         time.sleep(0.1)
 
 
-def _essence(status: dict[str, Any]) -> dict[str, Any]:
-    return {k: status[k] for k in ("phase", "mode", "ready", "revision", "shape", "failsafes", "rejected")}
+def _essence(status: Status) -> dict[str, Any]:
+    return {k: getattr(status, k) for k in ("phase", "mode", "ready", "revision", "shape", "failsafes", "rejected")}
 
 
 SETTLED = ("formed", "moving", "holding")
 """phases of a vehicle that has taken its slot"""
 
 
-def all_in(ids: list[int], *phases: str, revision: int = 0) -> Callable[[dict[int, dict[str, Any]]], bool]:
+def all_in(ids: list[int], *phases: str, revision: int = 0) -> Callable[[dict[int, Status]], bool]:
     """Whether all of these vehicles are in one of the phases, under a motion of at least that revision."""
-    return lambda said: all(i in said and said[i]["phase"] in phases and said[i]["revision"] >= revision for i in ids)
+    return lambda said: all(i in said and said[i].phase in phases and said[i].revision >= revision for i in ids)
 
 
 def eventually(condition: Callable[[], bool], timeout_s: float = PATIENCE_S) -> bool:
@@ -229,11 +227,12 @@ def minimum_distance_m(file: Path) -> float:
     )
 
 
-def status_json(fleet: Fleet, file: Path | None = None) -> tuple[int, Status]:
+def status_json(fleet: Fleet, file: Path | None = None) -> tuple[int, dict[int, Status | None]]:
     """`fleet status --json`: its exit status and what it printed."""
     done = run("sim", "status", "--json", "--fleet", str(file or fleet.file), folder=fleet.folder)
     assert done.stdout, done.stderr
-    return done.returncode, {int(i): s for i, s in json.loads(done.stdout).items()}
+    said = json.loads(done.stdout)
+    return done.returncode, {int(i): s and decode(Status, json.dumps(s).encode()) for i, s in said.items()}
 
 
 def flight_folder(out: Path) -> Path:

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from fleet_process import make_fleet, operator_of, run, started, wait_status
 
-from companion.vehicle.preflight import PARAMETERS
+from companion.vehicle.autopilot.px4_parameters import PARAMETERS
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(400)]
 
@@ -26,7 +26,7 @@ def test_a_computer_is_looked_over_with_its_autopilot_and_its_peers(tmp_path: Pa
         started("companion", "run", "--vehicle", "2", "--fleet", str(fleet.file), folder=tmp_path, name="companion"),
         operator_of(fleet) as operator,
     ):
-        wait_status(operator, lambda said: 2 in said and said[2]["ready"] == ["not heard: vehicle 1"])
+        wait_status(operator, lambda said: 2 in said and said[2].ready == ["not heard: vehicle 1"])
         done = run(*check, "1", "--seconds", "8", folder=tmp_path)
         busy = run(*check, "2", "--seconds", "1", folder=tmp_path)
     rows = rows_of(done.stdout)

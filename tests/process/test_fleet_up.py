@@ -28,7 +28,6 @@ from fleet_process import (
     SETTLED,
     Fleet,
     Process,
-    Status,
     all_in,
     child,
     children,
@@ -61,6 +60,7 @@ from companion.io.zenoh.configuration import (
 )
 from companion.operator.client import Operator
 from companion.wire.mavlink import Px4Mode, dialect
+from companion.wire.operator import Status
 from companion.wire.peer import encode_state
 from sim.__main__ import main as fleet_main
 
@@ -107,10 +107,8 @@ def failsafes(said: list[str]) -> list[str]:
     return [what for what in said if "own position stale" not in what]
 
 
-def rejected(status: dict[str, Any], kind: str) -> int:
-    count = status["rejected"].get(kind, 0)
-    assert isinstance(count, int)
-    return count
+def rejected(status: Status, kind: str) -> int:
+    return status.rejected.get(kind, 0)
 
 
 # -- one flight with everything that an operator and a stranger may do -----------------------------------------------
@@ -126,10 +124,10 @@ class Flown:
     err: str = ""
     folder: Path = Path()
     verbs: dict[str, subprocess.CompletedProcess[str]] = field(default_factory=dict)
-    seen: dict[str, dict[int, dict[str, Any]]] = field(default_factory=dict)
+    seen: dict[str, dict[int, Status]] = field(default_factory=dict)
     """what the vehicles said: before, and after each verb"""
-    after_garbage: Status = field(default_factory=dict)
-    status_of_five: tuple[int, Status] = (-1, {})
+    after_garbage: dict[int, Status | None] = field(default_factory=dict)
+    status_of_five: tuple[int, dict[int, Status | None]] = (-1, {})
 
     def say(self, verb: str, *arguments: str) -> None:
         self.verbs[verb] = run("sim", verb, *arguments, "--fleet", str(self.fleet.file), folder=self.fleet.folder)
@@ -287,13 +285,13 @@ def test_every_verb_is_acknowledged_by_every_vehicle(flown: Flown) -> None:
 
 
 def test_verbs_show_in_the_next_status(flown: Flown) -> None:
-    revisions = [{s["revision"] for s in flown.seen[step].values()} for step in ("formed", "form", "move", "hold")]
+    revisions = [{s.revision for s in flown.seen[step].values()} for step in ("formed", "form", "move", "hold")]
     assert revisions == [{2}, {3}, {4}, {5}]
-    assert {s["shape"] for s in flown.seen["formed"].values()} == {"v"}
-    assert {s["shape"] for s in flown.seen["hold"].values()} == {"line"}
-    (leg,) = flown.seen["move"][1]["motion"]["legs"]
+    assert {s.shape for s in flown.seen["formed"].values()} == {"v"}
+    assert {s.shape for s in flown.seen["hold"].values()} == {"line"}
+    (leg,) = flown.seen["move"][1].motion["legs"]
     assert leg["velocity_ned_m_s"] == [0.0, 0.5, 0.0]
-    assert flown.seen["hold"][1]["motion"]["legs"][0]["velocity_ned_m_s"] == [0.0, 0.0, 0.0]
+    assert flown.seen["hold"][1].motion["legs"][0]["velocity_ned_m_s"] == [0.0, 0.0, 0.0]
 
 
 def test_a_vehicle_that_is_not_there_is_named_as_silent(flown: Flown) -> None:
@@ -306,16 +304,16 @@ def test_a_stranger_on_the_autopilots_port_is_counted_and_moves_nothing(flown: F
     status = flown.after_garbage[1]
     assert status is not None
     assert rejected(status, "mavlink: another address than the autopilot's") == 3 * len(datagrams(1))
-    assert status["phase"] in SETTLED
-    assert status["mode"] == "OFFBOARD"
+    assert status.phase in SETTLED
+    assert status.mode == "OFFBOARD"
 
 
 def test_garbage_from_peers_is_counted_by_kind_and_moves_nothing(flown: Flown) -> None:
     for i in (1, 2, 3):
         status = flown.after_garbage[i]
         assert status is not None
-        assert status["phase"] in SETTLED
-        assert failsafes(status["failsafes"]) == []
+        assert status.phase in SETTLED
+        assert failsafes(status.failsafes) == []
         for kind, count in {
             "state: version": 2,
             "state: length": 2,
@@ -326,7 +324,7 @@ def test_garbage_from_peers_is_counted_by_kind_and_moves_nothing(flown: Flown) -
             "plan: motion": 3,
             "peer: malformed": 1,
         }.items():
-            assert rejected(status, kind) >= count, (i, kind, status["rejected"])
+            assert rejected(status, kind) >= count, (i, kind, status.rejected)
     first, last = flown.after_garbage[1], flown.after_garbage[4]
     assert first is not None
     assert rejected(first, "command: malformed") >= 3
@@ -347,7 +345,7 @@ class Loss:
     out: str = ""
     err: str = ""
     folder: Path = Path()
-    others: dict[int, dict[str, Any]] = field(default_factory=dict)
+    others: dict[int, Status] = field(default_factory=dict)
     """what the others said after the lost vehicle had landed"""
 
     @property
@@ -395,8 +393,8 @@ def test_the_lost_vehicles_autopilot_lands_it_by_its_own_failsafe(loss: Loss) ->
 def test_the_others_fly_on_and_keep_their_distance(loss: Loss) -> None:
     assert sorted(loss.others) == [1, 3, 4]
     for status in loss.others.values():
-        assert status["phase"] in SETTLED
-        assert failsafes(status["failsafes"]) == []
+        assert status.phase in SETTLED
+        assert failsafes(status.failsafes) == []
     assert minimum_distance_m(loss.folder / "truth.bin") >= 1.2
 
 
@@ -484,15 +482,15 @@ class Single:
 
     fleet: Fleet
     truth: Path
-    before_autopilot: dict[int, dict[str, Any]] = field(default_factory=dict)
-    waiting: dict[int, dict[str, Any]] = field(default_factory=dict)
+    before_autopilot: dict[int, Status] = field(default_factory=dict)
+    waiting: dict[int, Status] = field(default_factory=dict)
     """two companions there, the third vehicle's not; another fleet has a vehicle 3"""
     refused: subprocess.CompletedProcess[str] | None = None
-    other: dict[int, dict[str, Any]] = field(default_factory=dict)
+    other: dict[int, Status] = field(default_factory=dict)
     """what the other fleet's vehicle 3 said meanwhile"""
     busy: subprocess.CompletedProcess[str] | None = None
-    flying: dict[int, dict[str, Any]] = field(default_factory=dict)
-    restarted: dict[int, dict[str, Any]] = field(default_factory=dict)
+    flying: dict[int, Status] = field(default_factory=dict)
+    restarted: dict[int, Status] = field(default_factory=dict)
     """after vehicle 3's companion was killed and started again"""
     terminated_status: int = -1
     terminated_after_s: float = 0.0
@@ -515,8 +513,8 @@ class Companions:
         return self._stack.enter_context(started(*arguments, folder=self._fleet.folder, name=name))
 
 
-def ready_but_for(said: dict[int, dict[str, Any]], ids: list[int], reasons: list[str]) -> bool:
-    return all(i in said and said[i]["ready"] == reasons for i in ids)
+def ready_but_for(said: dict[int, Status], ids: list[int], reasons: list[str]) -> bool:
+    return all(i in said and said[i].ready == reasons for i in ids)
 
 
 @pytest.fixture(scope="module")
@@ -536,7 +534,7 @@ def single(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Single]:
         wait_status(operator, lambda said: sorted(said) == [1, 2])
         send(fleet.port, datagrams(1))
         single.before_autopilot = wait_status(
-            operator, lambda said: 1 in said and sum(said[1]["rejected"].values()) >= len(datagrams(1)) - 1
+            operator, lambda said: 1 in said and sum(said[1].rejected.values()) >= len(datagrams(1)) - 1
         )
         stub = stack.enter_context(
             started("sim", "stub", "--fleet", str(fleet.file), "--truth", str(single.truth), folder=folder, name="stub")
@@ -555,7 +553,7 @@ def single(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Single]:
         third.wait()
         again = mine.start(3)
         single.restarted = wait_status(
-            operator, lambda said: len(said) == 3 and said[3]["revision"] == 2 and not said[3]["armed"]
+            operator, lambda said: len(said) == 3 and said[3].revision == 2 and not said[3].armed
         )
         before = time.monotonic()
         second.signal(signal.SIGTERM)
@@ -572,7 +570,7 @@ def single(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Single]:
 
 def _land(operator: Operator, single: Single, first: Process) -> None:
     operator.land()
-    wait_status(operator, lambda said: said[1]["phase"] == "landed")
+    wait_status(operator, lambda said: said[1].phase == "landed")
     assert first.popen.poll() is None
 
 
@@ -583,7 +581,7 @@ def _end(process: Process) -> int:
 
 def test_what_no_autopilot_may_say_is_counted_by_kind_before_there_is_one(single: Single) -> None:
     status = single.before_autopilot[1]
-    assert "no heartbeat from the autopilot" in status["ready"]
+    assert "no heartbeat from the autopilot" in status.ready
     assert rejected(status, "not finite") == 2
     assert rejected(status, "foreign system") >= 1
     assert rejected(status, "malformed") >= 8
@@ -591,11 +589,11 @@ def test_what_no_autopilot_may_say_is_counted_by_kind_before_there_is_one(single
 
 
 def test_fleets_of_different_names_do_not_hear_each_other_on_one_scouting_port(single: Single) -> None:
-    assert single.waiting[1]["ready"] == ["not heard: vehicle 3"]
+    assert single.waiting[1].ready == ["not heard: vehicle 3"]
     assert 3 not in single.waiting
-    assert single.other[3]["phase"] == "idle"
-    assert single.other[3]["neighbours"] == 0
-    assert single.other[3]["rejected"].keys().isdisjoint({"own id", "foreign id", "peer: under our own id"})
+    assert single.other[3].phase == "idle"
+    assert single.other[3].neighbours == 0
+    assert single.other[3].rejected.keys().isdisjoint({"own id", "foreign id", "peer: under our own id"})
 
 
 def test_take_off_is_refused_while_a_vehicle_is_missing(single: Single) -> None:
@@ -606,7 +604,7 @@ def test_take_off_is_refused_while_a_vehicle_is_missing(single: Single) -> None:
 
 
 def test_a_companion_that_comes_late_flies_with_the_others(single: Single) -> None:
-    assert {s["phase"] for s in single.flying.values()} <= set(SETTLED)
+    assert {s.phase for s in single.flying.values()} <= set(SETTLED)
     assert len(single.flying) == 3
 
 

@@ -6,7 +6,6 @@ STARLING_FLOOD_INPUTS sets another number. The same flight is flown without the 
 loop by itself is known from it, and from an empty loop of 50 Hz that runs beside each flight.
 """
 
-import json
 import os
 import sys
 import time
@@ -27,7 +26,7 @@ from companion.io.replay import replay_file
 from companion.io.zenoh.configuration import session_settings, zenoh_configuration
 from companion.operator.client import Operator
 from companion.wire.mavlink import Px4Mode
-from companion.wire.peer import decode_motion
+from companion.wire.peer import motion_from_json
 from sim.launch.reference_loop import read_reference_loop
 
 pytestmark = [pytest.mark.process, pytest.mark.long, pytest.mark.timeout(900)]
@@ -57,7 +56,7 @@ class Seen:
 
 
 def newest_of(operator: Operator) -> FleetTrajectory:
-    motions = [decode_motion(json.dumps(s["motion"]).encode()) for s in operator.status().values() if s is not None]
+    motions = [motion_from_json(s.motion) for s in operator.status().values() if s is not None]
     return max(motions, key=lambda m: m.order)
 
 
@@ -132,7 +131,7 @@ def flown(folder: Path, flooded: bool) -> Seen:
         offboard[i] = bool((rows["custom_mode"] == Px4Mode.OFFBOARD).all())
     reference = read_reference_loop(seen / "reference.bin")
     within = reference[(reference[:, 0] >= begin_ns) & (reference[:, 0] <= end_ns), 1]
-    return Seen(seen, gaps, cpu_s, float(within.max()) * 1e-9, offboard, sorted(said), said[fleet.ids[0]]["rejected"])
+    return Seen(seen, gaps, cpu_s, float(within.max()) * 1e-9, offboard, sorted(said), said[fleet.ids[0]].rejected)
 
 
 def test_a_flood_of_inputs_ends_no_companion_stops_no_loop_and_takes_nobody_out_of_offboard(tmp_path: Path) -> None:

@@ -78,13 +78,11 @@ def looked(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Looked]:
         operator = stack.enter_context(operator_of(fleet))
         wait_status(
             operator,
-            lambda said: (
-                sorted(said) == [1, 2, 3] and all(s["ready"] == ["not heard: vehicle 4"] for s in said.values())
-            ),
+            lambda said: sorted(said) == [1, 2, 3] and all(s.ready == ["not heard: vehicle 4"] for s in said.values()),
         )
         set_parameter(fleet, 1, "COM_OBL_RC_ACT", 0)
         run("sim", "fault", "2", "low_battery", "--magnitude", "0.12", "--fleet", str(fleet.file), folder=folder)
-        wait_status(operator, lambda said: bool(said[1]["unfit"]) and bool(said[2]["unfit"]))
+        wait_status(operator, lambda said: bool(said[1].unfit) and bool(said[2].unfit))
         looked.status, looked.report = preflight(fleet)
         looked.refused = run("sim", "takeoff", "--fleet", str(fleet.file), folder=folder)
         looked.armed = any(truth(truth_file, i)["armed"].any() for i in fleet.ids)
@@ -95,7 +93,7 @@ def looked(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Looked]:
         strange.wait()
         companion(3, fleet.file, "three")
         companion(4, fleet.file, "four")
-        wait_status(operator, lambda said: len(said) == 4 and all(not s["ready"] for s in said.values()))
+        wait_status(operator, lambda said: len(said) == 4 and all(not s.ready for s in said.values()))
         looked.explained = run("sim", "preflight", "--explain", "--fleet", str(fleet.file), folder=folder)
 
         def comes_right() -> bool:

@@ -182,14 +182,14 @@ def test_a_vehicle_flies_over_a_serial_line(tmp_path: Path) -> None:
                 started("companion", "run", "--vehicle", "1", "--fleet", str(fleet.file), folder=tmp_path) as companion,
                 operator_of(fleet) as operator,
             ):
-                wait_status(operator, lambda said: 1 in said and said[1]["ready"] == [])
+                wait_status(operator, lambda said: 1 in said and said[1].ready == [])
                 assert operator.take_off().all_accepted
                 said = wait_status(operator, all_in([1], *SETTLED))
-                assert said[1]["rejected"].get("malformed", 0) == 0
+                assert said[1].rejected.get("malformed", 0) == 0
                 arguments = ("companion", "check", "--json", "--seconds", "1", "--vehicle", "1", "--fleet")
                 busy = run(*arguments, str(fleet.file), folder=tmp_path)
                 assert f"{device}: another process has it (is a companion running?)" in busy.stdout
-                assert not wait_status(operator, lambda said: 1 in said)[1]["failsafes"]
+                assert not wait_status(operator, lambda said: 1 in said)[1].failsafes
                 assert operator.land().all_accepted
                 wait_status(operator, all_in([1], "landed"))
                 companion.popen.terminate()

@@ -54,7 +54,7 @@ class Flying:
 
         def enough(said: dict[int, dict[str, Any]]) -> bool:
             assert self.up.popen.poll() is None, self.up.err
-            return all(i in said and said[i]["phase"] in phases for i in wanted)
+            return all(i in said and said[i].phase in phases for i in wanted)
 
         wait_status(self.operator, enough, PATIENCE_S)
 

@@ -111,7 +111,7 @@ def test_a_broken_law_at_the_speed_limit_stays_inside_on_px4_and_without_the_fen
     if fence:
         assert RADIUS_M - MARGIN_M - 1.0 < distance.max() < RADIUS_M - MARGIN_M + BEYOND_M
         assert rate[last].max() < REST_M_S
-        assert said["limited"]["fence"] > 100
+        assert said.limited["fence"] > 100
     else:
         assert distance.max() > RADIUS_M + 20.0
 
@@ -150,4 +150,4 @@ def test_a_move_for_ever_ends_at_the_fence_on_px4(tmp_path: Path, build: Path, r
     assert RADIUS_M - MARGIN_M - 1.0 < max(farthest_m.values()) < RADIUS_M - MARGIN_M + BEYOND_M
     assert max(rest_m_s.values()) < REST_M_S
     assert nearest_m > COLLISION_DISTANCE_M
-    assert any(s is not None and s["limited"]["fence"] > 100 for s in said.values())
+    assert any(s is not None and s.limited["fence"] > 100 for s in said.values())

@@ -80,7 +80,7 @@ def test_a_killed_companions_vehicle_lands_within_1_5_s_and_the_others_keep_thei
         for i in (1, 3):
             said = status[i]
             assert said is not None
-            assert said["phase"] in ("formed", "moving", "holding")
+            assert said.phase in ("formed", "moving", "holding")
         nearest_m = flight.minimum_distance_m([1, 2, 3], killed_ns)
         record_property("minimum distance (m)", nearest_m)
         assert nearest_m >= DISTANCE_MIN_M
@@ -100,14 +100,14 @@ def test_a_pilots_mode_change_ends_the_setpoints_at_once_and_for_good(
         time.sleep(5.0)  # long enough to see that it stays so
         said = flight.operator.status()[2]
         assert said is not None
-        assert (said["phase"], said["mode"]) == ("released", "AUTO_LOITER")
+        assert (said.phase, said.mode) == ("released", "AUTO_LOITER")
         flight.pilot(2, Px4Mode.AUTO_LAND)
         flight.wait("landed", 2, 3)
         assert eventually(lambda: flight.truth(3)["custom_mode"][-1] == int(Px4Mode.OFFBOARD), 20.0)  # the fall-back
         time.sleep(3.0)
         said = flight.operator.status()[3]
         assert said is not None
-        assert (said["phase"], said["armed"]) == ("landed", False)
+        assert (said.phase, said.armed) == ("landed", False)
         flight.up.signal(signal.SIGINT)
         flight.up.wait(120.0)
         for i, since_ns in taken_ns.items():

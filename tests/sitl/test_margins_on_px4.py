@@ -11,7 +11,7 @@ from fleet_process import make_fleet
 from px4_fleet import ALTITUDE_M, Flying, flying
 from slow_link import slow_link
 
-from companion.core.monitor import formation_error_m
+from sim.measures import formation_error_m
 
 COUNT = 3
 SLOW_S = 0.060
@@ -88,7 +88,7 @@ def flown(folder: Path, build: Path, delay_s: float) -> Margin:
         begin_ns = time.time_ns()
         time.sleep(WINDOW_S)
         said = {i: s for i, s in flight.operator.status().items() if s is not None}
-        assert {i: s["phase"] for i, s in said.items()} == dict.fromkeys(fleet.ids, "moving")
+        assert {i: s.phase for i, s in said.items()} == dict.fromkeys(fleet.ids, "moving")
         flight.up.signal(signal.SIGINT)
         flight.up.wait(120.0)
         return measured(flight, begin_ns, link.held_s)

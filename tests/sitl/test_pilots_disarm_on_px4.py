@@ -46,7 +46,7 @@ def check_one_disarm(vehicle: AgentOnLink, delay_s: float, port: int = GCS_PORT)
     """Take-off, arming, disarm after a while: it stays disarmed until it is commanded again."""
     agent = vehicle.agent
     vehicle.run_while(lambda: bool(agent.operator.unready(vehicle.now)), 60.0)
-    boot, begun, obeyed = agent.status(vehicle.now)["place"]
+    boot, begun, obeyed = agent.status(vehicle.now).place
     order = {"verb": "takeoff", "id": f"{delay_s}", "issuer": "test", "after": {"1": [[boot, begun, obeyed]]}}
     answer = json.loads(agent.receive_command(json.dumps(order).encode(), vehicle.now))
     assert answer["accepted"], answer

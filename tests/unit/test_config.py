@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 from companion.config import FleetConfig, load
 from companion.config.endpoints import autopilot_port, companion_port, serial_endpoint, udp_endpoint
 from companion.config.file import parse
+from companion.config.overrides import plan_legs, resize
 from companion.core.safety.fence import Fence
 from companion.core.trajectory.legs import GotoLeg, TurnLeg, VelocityLeg
 from companion.errors import ConfigError
-from sim.__main__ import _resize, plan_legs
 
 DEFAULT = Path(__file__).resolve().parents[2] / "fleet.toml"
 Tables = dict[str, Any]
@@ -588,23 +588,23 @@ def test_legs_begin_where_the_one_before_ends() -> None:
 
 def test_more_vehicles_get_the_free_ids_and_fewer_are_the_first() -> None:
     tables = changed(put("vehicle.1.id", 12))
-    _resize(tables, 12)
+    resize(tables, 12)
     config = parse(tables, "fleet.toml")
     assert [v.id for v in config.vehicles] == [1, 12, 3, 4, 5, 6, 7, 8, 9, 10, 2, 11]
-    _resize(tables, 3)
+    resize(tables, 3)
     assert [v["id"] for v in tables["vehicle"]] == [1, 12, 3]
 
 
 def test_as_many_vehicles_as_there_are_ids_can_be_asked_for() -> None:
     tables = default_tables()
-    _resize(tables, 250)
+    resize(tables, 250)
     assert sorted(v["id"] for v in tables["vehicle"]) == list(range(1, 251))
 
 
 @pytest.mark.parametrize("value", [5, "ten", [1, 2], {"id": 1}])
 def test_a_list_of_vehicles_that_is_none_is_left_to_the_validation(value: object) -> None:
     tables = changed(put("vehicle", value))
-    _resize(tables, 3)
+    resize(tables, 3)
     assert tables["vehicle"] == value
     with pytest.raises(ConfigError, match=r"\$\.vehicle"):
         parse(tables, "fleet.toml")

@@ -17,7 +17,7 @@ from companion.config import load
 from companion.core.counts import OTHER, Counts, RefusalKind
 from companion.core.failsafe import Failsafe
 from companion.core.frames import Ned
-from companion.core.neighbours import COUNTED as SAMPLES_COUNTED
+from companion.core.neighbours.table import COUNTED as SAMPLES_COUNTED
 from companion.core.safety.filter import ACTING
 from companion.core.trajectory.fleet import FleetTrajectory
 from companion.core.trajectory.legs import TurnLeg, VelocityLeg
@@ -26,6 +26,7 @@ from companion.core.values import Instant
 from companion.vehicle.agent import REJECTED, Agent
 from companion.vehicle.autopilot.px4 import COUNTED
 from companion.wire import mavlink
+from companion.wire.operator import encode
 from companion.wire.peer import encode_motion
 
 ROOT = Path(companion.__file__).resolve().parent
@@ -124,7 +125,7 @@ def test_two_thousand_refused_plans_of_as_many_revisions_leave_the_status_as_sma
     sizes = []
     for n in range(2000):
         agent.receive_peer("fleet/2/plan", encode_motion(replace(sound, revision=20_000 + n)), NOW)
-        sizes.append(len(json.dumps(agent.status(NOW)))) if n in (0, 1999) else None
+        sizes.append(len(encode(agent.status(NOW)))) if n in (0, 1999) else None
     assert set(agent.rejected) == {f"plan: {RefusalKind.REVISION}", "plan: more than can be examined"}
     assert sum(agent.rejected.values()) == 2000
     assert sizes[1] - sizes[0] <= 60

@@ -1,7 +1,6 @@
-"""Shapes for every size, and assignments that every vehicle finds alike."""
+"""Shapes for every size."""
 
-import random
-from itertools import pairwise, permutations, product
+from itertools import pairwise
 from math import dist, inf, pi, sqrt
 
 import numpy as np
@@ -11,8 +10,6 @@ from hypothesis import strategies as st
 
 from companion.core.formation import (
     SHAPES,
-    Slots,
-    assign,
     centred,
     minimum_distance,
     pairwise_distances_m,
@@ -119,69 +116,3 @@ def test_distances_come_in_the_order_of_pairs_with_their_vertical_scale() -> Non
     assert pairwise_distances_m(slots, 2.5) == pytest.approx([3.0, 2.0, sqrt(13.0)])
     assert minimum_distance(slots, 2.5) == pytest.approx(2.0)
     assert minimum_distance([]) == minimum_distance(slots[:1]) == inf
-
-
-def cost(origins: list[Ned], slots: list[Ned], assignment: tuple[int, ...]) -> float:
-    return sum(dist(o, slots[k]) ** 2 for o, k in zip(origins, assignment, strict=True))
-
-
-@PROPERTY
-@given(st.integers(1, 6).flatmap(lambda n: st.tuples(*[st.lists(points, min_size=n, max_size=n)] * 2)))
-def test_assignment_is_the_cheapest_of_all_permutations(lists: tuple[list[Ned], list[Ned]]) -> None:
-    origins, slots = lists
-    best = min(cost(origins, slots, p) for p in permutations(range(len(slots))))
-    found = assign(origins, slots)
-    assert sorted(found) == list(range(len(slots)))
-    assert cost(origins, slots, found) <= best + 1e-5
-
-
-@PROPERTY
-@given(st.integers(2, 5).flatmap(lambda n: st.tuples(*[st.lists(points, min_size=n, max_size=n)] * 2)), st.data())
-def test_assignment_with_pinned_slots_is_the_cheapest_that_keeps_them(
-    lists: tuple[list[Ned], list[Ned]], data: st.DataObject
-) -> None:
-    origins, slots = lists
-    n = len(slots)
-    rows = data.draw(st.lists(st.integers(0, n - 1), unique=True, max_size=n))
-    taken = data.draw(st.permutations(range(n)))
-    pinned = dict(zip(rows, taken, strict=False))
-    allowed = [p for p in permutations(range(n)) if all(p[row] == slot for row, slot in pinned.items())]
-    found = assign(origins, slots, pinned)
-    assert found in allowed
-    assert cost(origins, slots, found) <= min(cost(origins, slots, p) for p in allowed) + 1e-5
-
-
-@pytest.mark.parametrize("seed", range(10))
-def test_permuted_copies_of_one_problem_have_the_same_answer(seed: int) -> None:
-    rng = random.Random(seed)
-    origins = [Ned(*(rng.uniform(-20, 20) for _ in range(3))) for _ in range(12)]
-    slots = list(shape_slots("v", 12, 4.0))
-    found = assign(origins, slots)
-    order = list(range(12))
-    rng.shuffle(order)
-    again = assign([origins[k] for k in order], slots)
-    assert [found[k] for k in order] == list(again)
-
-
-@pytest.mark.parametrize("count", [2, 5, 10, 20, 30])
-def test_the_last_bits_of_coordinates_decide_nothing(count: int) -> None:
-    """Two machines whose sines differ in the last bit: symmetrical shapes are full of equal costs."""
-    rng = random.Random(count)
-
-    def shaken(slots: Slots) -> list[Ned]:
-        return [Ned(*(x * (1 + rng.uniform(-1, 1) * 4e-16) for x in s)) for s in slots]
-
-    names = ["v", "circle", "line", "grid", "v"]
-    for before, after in pairwise(names):
-        a, b = shape_slots(before, count, 4.0), shape_slots(after, count, 4.0)
-        assert {assign(shaken(a), shaken(b)) for _ in range(5)} == {assign(a, b)}
-
-
-@pytest.mark.parametrize(("before", "after"), list(product(LEVEL, repeat=2)))
-def test_paths_flown_together_keep_apart(before: str, after: str) -> None:
-    """The least sum of squares keeps straight, simultaneous paths of equal spacings at spacing/sqrt(2) at least."""
-    a, b = shape_slots(before, 12, 4.0), shape_slots(after, 12, 4.0)
-    order = assign(a, b)
-    start, end = np.array(a), np.array([b[k] for k in order])
-    nearest = min(minimum_distance((1 - m) * start + m * end) for m in np.linspace(0.0, 1.0, 101))
-    assert nearest >= 4.0 / sqrt(2.0) - 1e-6

@@ -2,6 +2,7 @@
 
 from math import cos, hypot, radians
 
+import pymap3d
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -40,6 +41,18 @@ def test_a_geodetic_point_comes_back_from_the_fleet_frame(
     assert back.latitude_deg == pytest.approx(point.latitude_deg, abs=1e-8)
     assert (back.longitude_deg - point.longitude_deg + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=1e-7)
     assert back.altitude_amsl_m == pytest.approx(point.altitude_amsl_m, abs=1e-6)
+
+
+@PROPERTY
+@given(origins, degrees(0.1), degrees(0.1))
+def test_the_level_is_that_of_a_library_which_nobody_here_wrote(
+    origin: Geodetic, north_deg: float, east_deg: float
+) -> None:
+    point = Geodetic(origin.latitude_deg + north_deg, origin.longitude_deg + east_deg, 0.0)
+    there = (point.latitude_deg, point.longitude_deg, 0.0, origin.latitude_deg, origin.longitude_deg, 0.0)
+    east, north, _ = pymap3d.geodetic2enu(*there)
+    ours = geodetic_to_ned(point, origin)
+    assert (ours.north, ours.east) == pytest.approx((north, east), abs=1e-8)
 
 
 @PROPERTY

@@ -9,7 +9,7 @@ from companion.core.values import Instant
 from companion.io.recorder import Entry
 from companion.io.replay import OUTPUTS, replay
 from companion.vehicle.agent import Agent
-from companion.vehicle.autopilot.px4 import NOTHING, Heard
+from companion.vehicle.autopilot.port import NOTHING, Heard
 from companion.vehicle.guard import ADVANCE_LIMIT_S, Guard
 from companion.vehicle.outputs import Outputs
 

@@ -2,23 +2,25 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+import statuses
 
 from companion.errors import CompanionError
 from companion.operator.client import Answers
+from companion.wire.operator import Status
 from sim.launch.ended import ENDED_FILE, read_ended, tell_ended
 from sim.launch.processes import how_it_ended
 from sim.launch.watch import LANDING_TIMEOUT_S, POLL_S, UNHEARD_S, MissingError, Progress, Watch
 
-Said = dict[int, dict[str, Any] | None]
+Said = dict[int, Status | None]
 
 
-def status(phase: str, armed: bool = True, age_s: float = 0.5) -> dict[str, Any]:
-    return {"phase": phase, "armed": armed, "autopilot_age_s": age_s, "ready": [], "unfit": []}
+def status(phase: str, armed: bool = True, age_s: float = 0.5) -> Status:
+    return statuses.status(phase=phase, armed=armed, autopilot_age_s=age_s)
 
 
 @dataclass
@@ -62,7 +64,7 @@ class Fleet:
         )  # fmt: skip
 
 
-def landing(third: Callable[[float], dict[str, Any] | None]) -> Callable[[float], Said]:
+def landing(third: Callable[[float], Status | None]) -> Callable[[float], Said]:
     """Two vehicles that have landed by 20 s, and a third."""
 
     def said(now_s: float) -> Said:
@@ -111,21 +113,21 @@ def test_an_autopilot_that_ends_before_take_off_is_named_at_once(tmp_path: Path)
         fleet.watch().take_off(30.0, lambda: False)
 
 
-def coming(third: Callable[[float], dict[str, Any] | None]) -> Callable[[float], Said]:
+def coming(third: Callable[[float], Status | None]) -> Callable[[float], Said]:
     """Two vehicles that are ready, and a third."""
     return lambda now_s: {1: status("idle"), 2: status("idle"), 3: third(now_s)}
 
 
-def unheard() -> dict[str, Any]:
+def unheard() -> Status:
     """A companion that has heard no autopilot yet."""
-    return {**status("idle"), "autopilot_age_s": None, "ready": ["no heartbeat from the autopilot"]}
+    return replace(status("idle"), autopilot_age_s=None, ready=["no heartbeat from the autopilot"])
 
 
 @pytest.mark.parametrize(
     ("third", "why"), [(None, "its companion does not answer"), (unheard(), "its autopilot is not heard")]
 )
 def test_who_does_not_come_is_named_once_within_fifteen_seconds_and_waited_for(
-    tmp_path: Path, third: dict[str, Any] | None, why: str
+    tmp_path: Path, third: Status | None, why: str
 ) -> None:
     fleet = Fleet(tmp_path, coming(lambda now_s: third if now_s < 40.0 else status("idle")))
     assert fleet.watch().take_off(120.0, lambda: False).all_accepted

@@ -8,14 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from companion.core.monitor import (
-    PeerMotion,
+from companion.core.monitor import PeerMotion, prediction_error_bound_m, unheard_error_m
+from sim.measures import (
     algebraic_connectivity,
     centroid_error_m,
     formation_error_m,
     minimum_distance_m,
-    prediction_error_bound_m,
-    unheard_error_m,
     velocity_error_m_s,
 )
 

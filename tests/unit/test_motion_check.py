@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.config import FleetConfig, load
+from companion.config.overrides import plan_legs
 from companion.core.budget import Bucket, ExaminationBudget
 from companion.core.frames import Ned
 from companion.core.route import LOOKS_MAX
@@ -37,7 +38,6 @@ from companion.errors import ConfigError
 from companion.operator.client import turn_leg
 from companion.vehicle.agent import Agent
 from companion.wire.peer import decode_motion, encode_motion
-from sim.__main__ import plan_legs
 
 FILE = Path(__file__).resolve().parents[2] / "fleet.toml"
 START_NS = 1_790_000_000_000_000_000

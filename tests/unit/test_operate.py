@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from statuses import FORMED
 
 from companion.config import FleetConfig, load
 from companion.core.frames import Ned
@@ -17,7 +18,6 @@ from companion.core.trajectory.legs import GotoLeg, TurnLeg, VelocityLeg
 from companion.core.trajectory.successors import over_the_pads, with_formation, with_legs
 from companion.errors import ConfigError, RefusedError
 from companion.operator.client import (
-    CLOCK_ROUNDS_LEAST,
     COMMAND_LEAD_NS,
     Answers,
     Operator,
@@ -25,7 +25,8 @@ from companion.operator.client import (
     turn_leg,
     velocity_leg,
 )
-from companion.vehicle.preflight import Check, PreflightReport, assignment_hash
+from companion.operator.clocks import ROUNDS_LEAST
+from companion.wire.operator import PLACES_MAX, Check, PreflightReport, decode_command, encode
 from companion.wire.peer import decode_motion, encode_motion
 
 CONFIG = load(Path(__file__).resolve().parents[2] / "fleet.toml", lambda t: t.update(vehicle=t["vehicle"][:4]))
@@ -40,12 +41,10 @@ def formed(config: FleetConfig = CONFIG) -> FleetTrajectory:
 
 
 def status(i: int, motion: FleetTrajectory, /, **more: object) -> dict[str, object]:
-    """What a vehicle tells of itself."""
+    """What a vehicle tells of itself, as JSON carries it."""
     return {
-        "vehicle": i, "fleet": "starling", "up_s": 100.0 + i, "place": [100 + i, 1, 4], "phase": "formed",
-        "mode": "OFFBOARD", "armed": True, "ready": [], "unfit": [], "revision": motion.revision, "shape": motion.shape,
-        "motion": json.loads(encode_motion(motion)), "position_error_m": 0.1, "neighbours": 3, "nearest_m": 4.0,
-        "oldest_age_s": 1.0, "messages": 7, "battery_percent": 90, "failsafes": [], "rejected": {}, **more,
+        **FORMED, "vehicle": i, "up_s": 100.0 + i, "place": [100 + i, 1, 4], "revision": motion.revision,
+        "shape": motion.shape, "motion": json.loads(encode_motion(motion)), "messages": 7, **more,
     }  # fmt: skip
 
 
@@ -100,7 +99,8 @@ class Fleet:
         here = self.places.get(i, [100 + i, 1, 4])
         in_order = here in json.loads(payload)["after"][str(i)]
         reason = self.refusals.get(i) if in_order else "not in order"
-        return {"vehicle": i, "accepted": reason is None, "reason": reason, "in_order": in_order, "place": here}
+        answer = {"vehicle": i, "accepted": reason is None, "reason": reason, "phase": "formed", "revision": 1}
+        return {**answer, "in_order": in_order, "place": here}
 
     def ask_timed(
         self, vehicle_ids: Iterable[int], kind: str, payload: bytes, timeout_s: float, retry_s: float
@@ -116,11 +116,13 @@ class Fleet:
     def account(self, i: int) -> bytes:
         vehicle = CONFIG.by_id(i)
         here = (vehicle.pad_north_m, vehicle.pad_east_m, 0.0)
-        return PreflightReport(
-            vehicle=i, boot_id=100 + i, system_id=i, configuration=CONFIG.shared_hash,
-            assignment=assignment_hash(CONFIG), flying=False, revision=0, position_ned_m=here, slot_ned_m=here,
-            origin_ned_m=here, home_altitude_amsl_m=488.0, checks=self.checks.get(i, ()),
-        ).model_dump_json().encode()  # fmt: skip
+        return encode(
+            PreflightReport(
+                vehicle=i, boot_id=100 + i, system_id=i, configuration=CONFIG.shared_hash,
+                assignment=CONFIG.assignment_hash, flying=False, revision=0, position_ned_m=here, slot_ned_m=here,
+                origin_ned_m=here, home_altitude_amsl_m=488.0, own_id_heard=False, checks=self.checks.get(i, ()),
+            )
+        )  # fmt: skip
 
     def commands(self) -> list[bytes]:
         return [payload for _, kind, payload in self.came if kind == "command"]
@@ -165,7 +167,7 @@ def test_nobody_is_told_to_take_off_unless_the_whole_fleet_is_fit() -> None:
 def test_a_fit_fleet_is_asked_for_its_clocks_a_few_times() -> None:
     link = fleet()
     assert Operator(CONFIG, link).preflight().fit
-    assert len([p for i, kind, p in link.came if i == 1 and p == b"clock"]) == CLOCK_ROUNDS_LEAST
+    assert len([p for i, kind, p in link.came if i == 1 and p == b"clock"]) == ROUNDS_LEAST
 
 
 def test_refusals_and_silence_are_told_by_vehicle() -> None:
@@ -185,7 +187,7 @@ def test_status_keeps_the_silent_apart() -> None:
     status = Operator(CONFIG, link).status()
     assert status[1] is None
     assert status[2] is not None
-    assert status[2]["vehicle"] == 2
+    assert status[2].vehicle == 2
 
 
 def test_a_new_formation_follows_the_newest_motion_that_anyone_holds() -> None:
@@ -397,22 +399,43 @@ def test_what_ends_a_flight_reaches_both_if_that_is_wanted() -> None:
 
 def test_a_second_companion_that_shows_only_in_the_answers_is_told() -> None:
     link = fleet()
-    here = json.dumps({"vehicle": 3, "accepted": True, "place": [103, 1, 4]}).encode()
+    here = json.dumps({"vehicle": 3, "accepted": True, "reason": None, "place": [103, 1, 4]}).encode()
     other = {"vehicle": 3, "accepted": False, "reason": "it is for another companion", "in_order": False}
     link.raw[3, "command"] = (here, json.dumps({**other, "place": [7, 1, 4]}).encode())
     answers = Operator(CONFIG, link).resume()
     assert answers.refused == {3: "two companions answer as this vehicle: it is for another companion"}
 
 
+@pytest.mark.parametrize("answer", [b"{}", b"[]", b'{"vehicle":3,"accepted":1,"reason":null}', b"[" * 100_000])
+def test_an_answer_that_cannot_be_read_is_none_and_is_named(answer: bytes) -> None:
+    link = fleet()
+    link.raw[3, "command"] = (answer,)
+    answers = Operator(CONFIG, link).land()
+    assert answers.accepted == (1, 2, 4)
+    assert answers.silent == (3,)
+    assert "vehicle 3's answer cannot be read: " in answers.sentence("land")
+
+
+def test_a_vehicle_that_answers_as_ever_new_companions_spoils_no_command_to_the_others() -> None:
+    link = fleet()
+    link.raw[3, "status"] = tuple(
+        json.dumps(status(3, formed(), place=[boot, 1, 4])).encode() for boot in range(1, 2 * PLACES_MAX)
+    )
+    link.raw[3, "command"] = (b'{"vehicle":3,"accepted":false,"reason":"no","in_order":false,"place":[99,1,4]}',)
+    answers = Operator(CONFIG, link, both=True).land()
+    assert answers.accepted == (1, 2, 4)
+    assert all(len(decode_command(p).after.get(3, ())) <= PLACES_MAX for p in link.commands())
+
+
 def test_a_verb_tells_which_flight_it_reached() -> None:
     link = fleet()
     operator = Operator(CONFIG, link)
-    assert operator.reached == "fleet starling: nobody"
+    assert operator.roster.reached == "fleet starling: nobody"
     operator.land()
-    assert operator.reached == "fleet starling, companions up for 104 s"
+    assert operator.roster.reached == "fleet starling, companions up for 104 s"
     link.told[2] = {"up_s": 3.0}
     operator.land()
-    assert operator.reached == "fleet starling, companions up for 3 to 104 s"
+    assert operator.roster.reached == "fleet starling, companions up for 3 to 104 s"
 
 
 def test_a_climb_for_ever_is_not_sent() -> None:

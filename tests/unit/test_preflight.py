@@ -1,6 +1,7 @@
 """One vehicle's preflight: every limit just below, at, and just above."""
 
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
 from math import nan
 from pathlib import Path
 from typing import Any
@@ -8,17 +9,11 @@ from typing import Any
 import pytest
 
 from companion.config import FleetConfig, load
-from companion.core.frames import Ned, ned_to_geodetic
-from companion.vehicle.preflight import (
-    PARAMETERS,
-    AutopilotFacts,
-    Check,
-    PreflightReport,
-    assignment_hash,
-    own_checks,
-    parameter_rules,
-    unmet,
-)
+from companion.core.frames import Geodetic, Ned, ned_to_geodetic
+from companion.vehicle.autopilot.port import AutopilotFacts, Estimate
+from companion.vehicle.autopilot.px4_parameters import PARAMETERS, identity_checks, parameter_checks, parameter_rules
+from companion.vehicle.preflight import own_checks
+from companion.wire.operator import Check, PreflightReport, decode, encode, unmet
 
 FILE = Path(__file__).resolve().parents[2] / "fleet.toml"
 PAD = Ned(2.0, -8.0, 0.0)
@@ -37,8 +32,44 @@ def config(**preflight: Any) -> FleetConfig:
     return load(FILE, change)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Px4Facts:
+    """What a PX4 has said, as preflight is asked about it."""
+
+    heartbeat_age_s: float | None
+    foreign_system_id: int | None = None
+    autopilot_kind: int = 12
+    vehicle_type: int = 2
+    estimator_flags: int
+    sensors_health: int = 0
+    horizontal_accuracy_m: float
+    origin: Geodetic | None
+    home_altitude_amsl_m: float | None
+    position_ned_m: Ned | None
+    position_age_s: float
+    position_rate_hz: float
+    battery_percent: int
+    round_trip_s: float | None
+    clock_ahead_s: float | None
+    parameters: Mapping[str, float | int]
+    missing: frozenset[str] = frozenset()
+
+    def judged(self, of: FleetConfig) -> AutopilotFacts:
+        px4 = ("autopilot_kind", "vehicle_type", "estimator_flags", "sensors_health", "horizontal_accuracy_m",
+               "parameters", "missing")  # fmt: skip
+        rows = parameter_checks(self.parameters, self.missing, of) if self.autopilot_kind == 12 else ()
+        needed = 0x17 if of.fleet.frame == "global" else 0xF
+        return AutopilotFacts(
+            **{f.name: getattr(self, f.name) for f in fields(self) if f.name not in px4},
+            identity=identity_checks(self.autopilot_kind, self.vehicle_type),
+            settings=tuple(rows),
+            estimate=Estimate(self.estimator_flags, needed, self.horizontal_accuracy_m),
+            rc_healthy=bool(self.sensors_health & 1 << 16),
+        )
+
+
 CONFIG = config()
-FIT = AutopilotFacts(
+FIT = Px4Facts(
     heartbeat_age_s=0.5, autopilot_kind=12, vehicle_type=2, estimator_flags=0x3FF, horizontal_accuracy_m=0.5,
     origin=ned_to_geodetic(Ned(3.0, 4.0, 0.5), CONFIG.origin), home_altitude_amsl_m=488.1, position_ned_m=PAD,
     position_age_s=0.02, position_rate_hz=50.0, battery_percent=90, round_trip_s=0.01, clock_ahead_s=0.001,
@@ -46,12 +77,12 @@ FIT = AutopilotFacts(
 )  # fmt: skip
 
 
-def faults(facts: AutopilotFacts, of: FleetConfig = CONFIG, place: Ned | None = PAD) -> list[str]:
-    return [c.message for c in unmet(own_checks(facts, of, of.vehicles[0], place))]
+def faults(facts: Px4Facts, of: FleetConfig = CONFIG, place: Ned | None = PAD) -> list[str]:
+    return [c.message for c in unmet(own_checks(facts.judged(of), of, of.vehicles[0], place))]
 
 
 def test_a_fit_vehicle_meets_every_row_and_each_row_names_it() -> None:
-    rows = own_checks(FIT, CONFIG, CONFIG.vehicles[2], PAD)
+    rows = own_checks(FIT.judged(CONFIG), CONFIG, CONFIG.vehicles[2], PAD)
     assert unmet(rows) == []
     assert {c.vehicle for c in rows} == {3}
     assert len({c.name for c in rows}) == len(rows)
@@ -109,11 +140,11 @@ def test_the_estimators_origin_must_be_near_the_fleets(north: float, fit: bool) 
 
 
 def test_before_the_heartbeat_nothing_else_is_told() -> None:
-    assert faults(AutopilotFacts(heartbeat_age_s=None)) == ["no heartbeat from the autopilot"]
+    assert faults(replace(FIT, heartbeat_age_s=None)) == ["no heartbeat from the autopilot"]
 
 
 def test_an_autopilot_of_another_system_id_is_named() -> None:
-    said = faults(AutopilotFacts(heartbeat_age_s=None, foreign_system_id=9))
+    said = faults(replace(FIT, heartbeat_age_s=None, foreign_system_id=9))
     assert said[1] == "an autopilot of system id 9 is on the link, fleet.toml says 1"
 
 
@@ -220,8 +251,8 @@ def test_of_an_autopilot_that_is_no_px4_no_parameter_is_wanted() -> None:
 
 
 def test_only_what_waiting_may_heal_is_waited_for() -> None:
-    def permanent(facts: AutopilotFacts) -> bool:
-        (row,) = unmet(own_checks(facts, CONFIG, CONFIG.vehicles[0], PAD))
+    def permanent(facts: Px4Facts) -> bool:
+        (row,) = unmet(own_checks(facts.judged(CONFIG), CONFIG, CONFIG.vehicles[0], PAD))
         return row.permanent
 
     assert permanent(replace(FIT, parameters={**FIT_PARAMETERS, "GF_ACTION": 4}))
@@ -233,20 +264,27 @@ def test_only_what_waiting_may_heal_is_waited_for() -> None:
 
 
 def test_an_account_survives_its_journey() -> None:
-    rows = own_checks(replace(FIT, position_age_s=float("inf"), round_trip_s=None), CONFIG, CONFIG.vehicles[0], PAD)
+    said = replace(FIT, position_age_s=float("inf"), round_trip_s=None)
+    rows = own_checks(said.judged(CONFIG), CONFIG, CONFIG.vehicles[0], PAD)
     account = PreflightReport(
         vehicle=1, boot_id=7, system_id=1, configuration="c", assignment="a", flying=False, revision=0,
-        position_ned_m=PAD, slot_ned_m=PAD, origin_ned_m=None, home_altitude_amsl_m=None, checks=rows,
+        position_ned_m=PAD, slot_ned_m=PAD, origin_ned_m=None, home_altitude_amsl_m=None, own_id_heard=False,
+        checks=rows,
     )  # fmt: skip
-    again = PreflightReport.model_validate_json(account.model_dump_json())
+    again = decode(PreflightReport, encode(account))
     assert again == account
     assert isinstance(again.checks[0], Check)
 
 
 def test_the_assignments_hash_follows_slots_and_vehicles() -> None:
-    assert assignment_hash(CONFIG) == assignment_hash(config(battery_min_percent=50.0))
-    wider = CONFIG.model_copy(update={"formation": CONFIG.formation.model_copy(update={"spacing_m": 5.0})})
-    assert assignment_hash(wider) != assignment_hash(CONFIG)
+    assert CONFIG.assignment_hash == config(battery_min_percent=50.0).assignment_hash
+
+    def widen(tables: dict[str, Any]) -> None:
+        tables["vehicle"] = tables["vehicle"][:3]
+        tables["formation"]["spacing_m"] = 5.0
+
+    wider = load(FILE, widen)
+    assert wider.assignment_hash != CONFIG.assignment_hash
 
 
 def test_the_name_under_which_this_px4_has_a_setting_is_enough_and_one_is_needed() -> None:

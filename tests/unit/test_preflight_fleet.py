@@ -9,14 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.config import FleetConfig, load
-from companion.operator.preflight import (
-    ClockOffset,
-    Report,
-    best_offset,
-    change_distances_m,
-    fleet_report,
-)
-from companion.vehicle.preflight import Check, PreflightReport, assignment_hash, first_formation
+from companion.operator.clocks import ClockOffset, Exchange, best_offset
+from companion.operator.preflight import FleetReport, fleet_report
+from companion.operator.ways import change_distances_m
+from companion.wire.operator import Check, PreflightReport
 
 FILE = Path(__file__).resolve().parents[2] / "fleet.toml"
 
@@ -38,9 +34,9 @@ def account(i: int, of: FleetConfig = CONFIG, **more: Any) -> PreflightReport:
     here = (v.pad_north_m, v.pad_east_m, 0.0)
     facts: dict[str, Any] = {
         "vehicle": i, "boot_id": 100 + i, "system_id": v.system_id, "configuration": of.shared_hash,
-        "assignment": assignment_hash(of), "flying": False, "revision": 0, "position_ned_m": here,
+        "assignment": of.assignment_hash, "flying": False, "revision": 0, "position_ned_m": here,
         "slot_ned_m": (here[0], here[1], -10.0), "origin_ned_m": (1.0, 2.0, 0.0), "home_altitude_amsl_m": 488.0,
-        "checks": (), **more,
+        "own_id_heard": False, "checks": (), **more,
     }  # fmt: skip
     return PreflightReport(**facts)
 
@@ -51,7 +47,7 @@ def report(
     of: FleetConfig = CONFIG,
     offsets: dict[int, ClockOffset | None] | None = None,
     boots: dict[int, frozenset[int]] | None = None,
-) -> Report:
+) -> FleetReport:
     ids = [v.id for v in of.vehicles]
     accounts: dict[int, PreflightReport | None] = {i: account(i, of) for i in ids} | (changed or {})
     clocks: dict[int, ClockOffset | None] = {i: ClockOffset(0.0, 0.001) for i in ids}
@@ -153,7 +149,7 @@ def test_an_offset_is_known_to_within_its_uncertainty(ahead_ms: int, ways_ms: li
         asked = 1_700_000_000_000 + 1000 * k
         received = asked + there + ahead_ms
         readings.append((asked, received, received + inside, asked + there + inside + back))
-    offset = best_offset([tuple(x * 1_000_000 for x in r) for r in readings])  # type: ignore[misc]
+    offset = best_offset(Exchange(*(x * 1_000_000 for x in r)) for r in readings)
     assert offset is not None
     assert abs(offset.ahead_s - ahead_ms * 1e-3) <= offset.uncertain_s + 1e-9
     assert offset.uncertain_s == pytest.approx(min(there + back for there, back, _ in ways_ms) * 0.5e-3)
@@ -161,7 +157,7 @@ def test_an_offset_is_known_to_within_its_uncertainty(ahead_ms: int, ways_ms: li
 
 def test_a_reading_that_cannot_be_is_left_out() -> None:
     assert best_offset([]) is None
-    assert best_offset([(10, 100, 300, 20)]) is None
+    assert best_offset([Exchange(10, 100, 300, 20)]) is None
 
 
 # -- where the vehicles stand ------------------------------------------------------------------------------------------
@@ -292,7 +288,7 @@ def test_the_shapes_of_the_default_file_can_be_taken_from_its_pads(shape: str, c
 @given(angle=st.floats(-pi, pi), count=st.integers(2, 6))
 def test_the_least_distance_is_that_of_the_flown_blend(angle: float, count: int) -> None:
     of = config(count, formation={"shape": "circle", "heading_deg": angle * 180 / pi})
-    motion = first_formation(of, of.first_motion)
+    motion = of.first_formation
     exact = change_distances_m(motion)
     steps = 400
     seen = dict.fromkeys(exact, float("inf"))

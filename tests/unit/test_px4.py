@@ -2,6 +2,7 @@
 
 import struct
 from math import inf
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -9,25 +10,26 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import development as dialect
 
+from companion.config import load
 from companion.core.events import RequestRefused, RequestUnanswered
 from companion.core.frames import Geodetic, Ned, ned_to_geodetic
 from companion.core.values import Instant
-from companion.vehicle.autopilot.px4 import (
-    LATENCY_WINDOW_NS,
+from companion.vehicle.autopilot.boot_clock import LATENCY_WINDOW_NS, BootClock
+from companion.vehicle.autopilot.parameter_reader import (
     PARAMETER_PERIOD_NS,
     PARAMETER_TRIES,
     PARAMETERS_AT_ONCE,
-    RETRY_S,
-    TRIES,
-    BootClock,
-    Px4Autopilot,
 )
-from companion.vehicle.preflight import PARAMETERS
+from companion.vehicle.autopilot.port import OFFBOARD, FlightMode, Verb
+from companion.vehicle.autopilot.px4 import Px4Autopilot
+from companion.vehicle.autopilot.px4_parameters import PARAMETERS
+from companion.vehicle.autopilot.requests import RETRY_S, TRIES
 from companion.wire import mavlink as wire
 from companion.wire.mavlink import Px4Mode
 
 SYSTEM_ID = 7
 FLEET = Geodetic(47.397742, 8.545594, 488.0)
+FILE = Path(__file__).resolve().parents[2] / "fleet.toml"
 DELAY_S = 0.001
 ESTIMATOR_OK = 1 | 2 | 4 | 8 | 16
 
@@ -86,8 +88,14 @@ class Px4:
             self.hear(start_s + k * period_s)
 
 
-def px4(origin: Geodetic | None = FLEET) -> Px4:
-    return Px4(Px4Autopilot(SYSTEM_ID, origin))
+def px4(frame: str = "global") -> Px4:
+    def change(tables: dict[str, Any]) -> None:
+        tables["fleet"]["frame"] = frame
+        if frame == "local":
+            del tables["fleet"]["origin"]
+
+    config = load(FILE, change)
+    return Px4(Px4Autopilot(config, config.by_id(SYSTEM_ID)))
 
 
 def ready(at_s: float = 10.0) -> Px4:
@@ -223,7 +231,7 @@ def test_the_streams_are_asked_for_one_after_the_other() -> None:
 
 def test_a_request_is_repeated_until_it_is_answered() -> None:
     one = ready()
-    one.client.ask("arming", *wire.arm_parameters(True))
+    one.client.requests.ask("arming", *wire.arm_parameters(True))
     one.run(10.0, 11.2)
     assert one.times_of(400) == pytest.approx([10.0, 10.5, 11.0])
     one.answer(400, 0, 11.2)
@@ -233,7 +241,7 @@ def test_a_request_is_repeated_until_it_is_answered() -> None:
 
 def test_a_request_that_is_never_answered_is_given_up_and_noted() -> None:
     one = ready()
-    one.client.ask("arming", *wire.arm_parameters(True))
+    one.client.requests.ask("arming", *wire.arm_parameters(True))
     one.run(10.0, 10.0 + TRIES * RETRY_S + 1.0)
     assert len(one.times_of(400)) == TRIES
     assert RequestUnanswered("arming") in one.client.events
@@ -242,7 +250,7 @@ def test_a_request_that_is_never_answered_is_given_up_and_noted() -> None:
 def test_the_same_request_is_not_queued_twice() -> None:
     one = ready()
     for _ in range(50):
-        one.client.ask("arming", *wire.arm_parameters(True))
+        one.client.requests.ask("arming", *wire.arm_parameters(True))
     one.hear(10.0)
     one.answer(400, 0, 10.01)
     one.run(10.05, 12.0)
@@ -253,7 +261,7 @@ def test_a_refusal_is_noted_and_the_request_not_repeated_at_once() -> None:
     one = ready()
     for k in range(100):
         now = 10.0 + 0.02 * k
-        one.client.ask("arming", *wire.arm_parameters(True))
+        one.client.requests.ask("arming", *wire.arm_parameters(True))
         if any(m.get_type() == "COMMAND_LONG" and m.command == 400 for m in one.hear(now)):
             one.answer(400, 2, now + 0.001)
     assert 3 <= len(one.times_of(400)) <= 5
@@ -264,7 +272,7 @@ def test_a_refusal_is_noted_and_the_request_not_repeated_at_once() -> None:
 @pytest.mark.parametrize("result", [1, 5], ids=["temporarily rejected", "in progress"])
 def test_an_answer_that_decides_nothing_leaves_the_request_open(result: int) -> None:
     one = ready()
-    one.client.ask("arming", *wire.arm_parameters(True))
+    one.client.requests.ask("arming", *wire.arm_parameters(True))
     one.hear(10.0)
     one.answer(400, result, 10.1)
     one.run(10.1, 11.0)
@@ -275,7 +283,7 @@ def test_an_answer_that_decides_nothing_leaves_the_request_open(result: int) -> 
 def test_an_answer_to_nothing_asked_is_counted() -> None:
     one = ready()
     one.answer(400, 0, 10.0)
-    one.client.ask("arming", *wire.arm_parameters(True))
+    one.client.requests.ask("arming", *wire.arm_parameters(True))
     one.answer(400, 0, 10.0)
     one.hear(10.0)
     assert one.times_of(400) == [10.0]
@@ -284,9 +292,9 @@ def test_an_answer_to_nothing_asked_is_counted() -> None:
 
 def test_a_new_mode_takes_the_place_of_the_one_before() -> None:
     one = ready()
-    one.client.set_mode(Px4Mode.OFFBOARD)
+    one.client.engage()
     one.hear(10.0)
-    one.client.set_mode(Px4Mode.AUTO_LAND)
+    one.client.land()
     one.run(10.05, 12.0)
     modes = [(m.param2, m.param3) for _, m in one.asked if m.command == 176]
     assert modes[0] == (6.0, 0.0)
@@ -295,9 +303,9 @@ def test_a_new_mode_takes_the_place_of_the_one_before() -> None:
 
 def test_what_is_withdrawn_is_not_repeated_and_its_late_answer_is_no_surprise() -> None:
     one = ready()
-    one.client.ask("take-off", *wire.takeoff_parameters(498.0))
+    one.client.requests.ask("take-off", *wire.takeoff_parameters(498.0))
     one.hear(10.0)
-    one.client.withdraw("take-off", "arming")
+    one.client.withdraw(Verb.TAKE_OFF, Verb.ARM)
     one.run(10.05, 10.4)
     one.answer(22, 2, 10.4)
     one.run(10.4, 16.0)
@@ -309,16 +317,16 @@ def test_what_is_withdrawn_is_not_repeated_and_its_late_answer_is_no_surprise() 
 
 def test_what_is_withdrawn_before_it_was_sent_is_never_sent() -> None:
     one = ready()
-    one.client.ask("arming", *wire.arm_parameters(True))
-    one.client.withdraw("arming")
+    one.client.requests.ask("arming", *wire.arm_parameters(True))
+    one.client.withdraw(Verb.ARM)
     one.run(10.0, 12.0)
     assert one.times_of(400) == []
 
 
 def test_after_cancelling_nothing_but_heartbeats_is_sent() -> None:
     one = ready()
-    one.client.ask("arming", *wire.arm_parameters(True))
-    one.client.set_mode(Px4Mode.OFFBOARD)
+    one.client.requests.ask("arming", *wire.arm_parameters(True))
+    one.client.engage()
     one.client.cancel()
     one.run(10.0, 15.0)
     assert one.asked == []
@@ -327,7 +335,7 @@ def test_after_cancelling_nothing_but_heartbeats_is_sent() -> None:
 def test_the_next_deadline_is_when_something_is_due() -> None:
     one = ready()
     one.run(10.0, 20.0)
-    one.client.ask("arming", *wire.arm_parameters(True))
+    one.client.requests.ask("arming", *wire.arm_parameters(True))
     deadlines = []
     now_ns = at(20.0).monotonic_ns
     for _ in range(30):
@@ -372,7 +380,7 @@ def test_an_origin_that_moves_moves_the_frame_and_is_noted() -> None:
 
 
 def test_in_a_local_frame_the_autopilots_frame_is_the_fleets() -> None:
-    one = px4(None)
+    one = px4("local")
     one.heartbeat(0.0)
     assert one.position(1.0, 1.0, 2.0, -3.0, 0.0, 0.0, 0.0)
     one.origin(1.5, Ned(10.0, -20.0, 0.5))
@@ -394,9 +402,10 @@ def test_the_facts_are_what_the_autopilot_has_said() -> None:
     facts = one.client.facts(at(10.4))
     assert facts.heartbeat_age_s == pytest.approx(0.4)
     assert facts.position_age_s == pytest.approx(0.4, abs=0.002)
-    assert (facts.autopilot_kind, facts.vehicle_type) == (12, 2)
-    assert (facts.estimator_flags, facts.horizontal_accuracy_m) == (ESTIMATOR_OK, 0.5)
-    assert (facts.battery_percent, facts.sensors_health) == (55, 1 << 16)
+    assert [(c.value, c.passed) for c in facts.identity] == [(12, True), (2, True)]
+    assert (facts.estimate.flags, facts.estimate.accuracy_m) == (ESTIMATOR_OK, 0.5)
+    assert facts.estimate.certain
+    assert (facts.battery_percent, facts.rc_healthy) == (55, True)
     assert facts.home_altitude_amsl_m == pytest.approx(489.5)
     assert facts.origin is not None
     assert facts.clock_ahead_s is None
@@ -434,10 +443,10 @@ def test_what_estimator_and_battery_said_is_unknown_once_it_is_old() -> None:
     one = ready(10.0)
     one.says(dialect.MAVLink_sys_status_message(0, 0, 1 << 16, 0, 0, 0, 55, 0, 0, 0, 0, 0, 0), 10.0)
     fresh, old = one.client.facts(at(15.0)), one.client.facts(at(15.01))
-    assert (fresh.estimator_flags, fresh.horizontal_accuracy_m) == (ESTIMATOR_OK, 0.5)
-    assert (fresh.battery_percent, fresh.sensors_health) == (55, 1 << 16)
-    assert (old.estimator_flags, old.horizontal_accuracy_m) == (0, inf)
-    assert (old.battery_percent, old.sensors_health) == (-1, 0)
+    assert (fresh.estimate.flags, fresh.estimate.accuracy_m) == (ESTIMATOR_OK, 0.5)
+    assert (fresh.battery_percent, fresh.rc_healthy) == (55, True)
+    assert (old.estimate.flags, old.estimate.accuracy_m) == (0, inf)
+    assert (old.battery_percent, old.rc_healthy) == (-1, False)
     assert one.client.battery(at(15.01)) == -1
 
 
@@ -476,9 +485,8 @@ def test_of_the_names_of_one_setting_the_one_that_answers_is_read_and_the_other_
     gone = frozenset({"COM_RC_OVERRIDE"})
     first_round = answered(one, 10.0, 11.5, gone)
     assert sum(name in gone for _, name in first_round) <= 2
-    facts = one.client.facts(at(11.5))
-    assert set(facts.parameters) == set(OF_1_18)
-    assert facts.missing == frozenset()
+    assert set(one.client.parameters.values) == set(OF_1_18)
+    assert one.client.parameters.missing == set()
     assert [name for _, name in answered(one, 11.5, 20.0, gone)] == list(OF_1_18)
 
 
@@ -486,8 +494,8 @@ def test_all_parameters_are_read_within_a_second_a_few_at_a_time() -> None:
     one = ready(10.0)
     asked = answered(one, 10.0, 11.0)
     assert [name for _, name in asked] == list(OF_1_16)
-    assert set(one.client.facts(at(11.0)).parameters) == set(OF_1_16)
-    assert one.client.facts(at(11.0)).parameters["COM_OBL_RC_ACT"] == 4
+    assert set(one.client.parameters.values) == set(OF_1_16)
+    assert one.client.parameters.values["COM_OBL_RC_ACT"] == 4
     assert max(sum(t == now for t, _ in asked) for now, _ in asked) <= PARAMETERS_AT_ONCE
 
 
@@ -497,7 +505,7 @@ def test_whole_parameters_come_bytewise() -> None:
     tells(one, "NAV_RCL_ACT", -1, 10.0)
     tells(one, "COM_OF_LOSS_T", 0.5, 10.0)
     tells(one, "SYS_AUTOSTART", 4001, 10.0)
-    parameters = one.client.facts(at(10.0)).parameters
+    parameters = one.client.parameters.values
     assert parameters == {"COM_RCL_EXCEPT": 4, "NAV_RCL_ACT": -1, "COM_OF_LOSS_T": 0.5}
 
 
@@ -506,11 +514,10 @@ def test_a_parameter_that_never_comes_is_missing_and_the_others_are_read() -> No
     asked = answered(one, 10.0, 14.5, frozenset({"GF_ACTION"}))
     times = [t for t, name in asked if name == "GF_ACTION"]
     assert times == pytest.approx([times[0] + RETRY_S * k for k in range(PARAMETER_TRIES)], abs=0.011)
-    facts = one.client.facts(at(14.5))
-    assert facts.missing == {"GF_ACTION"}
-    assert set(facts.parameters) == set(OF_1_16) - {"GF_ACTION"}
+    assert one.client.parameters.missing == {"GF_ACTION"}
+    assert set(one.client.parameters.values) == set(OF_1_16) - {"GF_ACTION"}
     tells(one, "GF_ACTION", 2, 14.6)
-    assert one.client.facts(at(14.6)).missing == frozenset()
+    assert one.client.parameters.missing == set()
 
 
 def test_parameters_are_read_anew_on_the_ground_and_left_alone_in_flight() -> None:
@@ -530,7 +537,7 @@ def test_a_reboot_forgets_the_parameters() -> None:
     one = ready(100.0)
     answered(one, 100.0, 101.0)
     one.position(110.0, boot_ms=2_000)
-    assert one.client.facts(at(110.0)).parameters == {}
+    assert one.client.parameters.values == {}
 
 
 # -- round trip and the autopilot's clock ------------------------------------------------------------------------------
@@ -583,7 +590,8 @@ def test_state_of_the_autopilot_is_what_it_last_said() -> None:
     one.says(dialect.MAVLink_extended_sys_state_message(0, 2), 10.0)
     one.says(dialect.MAVLink_sys_status_message(0, 0, 0, 0, 0, 0, 55, 0, 0, 0, 0, 0, 0), 10.0)
     client = one.client
-    assert (client.armed, client.custom_mode) == (True, Px4Mode.OFFBOARD)
-    assert (client.landed_state, client.battery_percent) == (2, 55)
+    assert (client.armed, client.mode, client.mode_name) == (True, OFFBOARD, "OFFBOARD")
+    assert (client.on_ground, client.battery_percent) == (False, 55)
     one.says(dialect.MAVLink_current_mode_message(0, int(Px4Mode.POSCTL), 0), 10.1)
-    assert client.custom_mode == Px4Mode.POSCTL
+    assert client.mode == FlightMode("POSCTL")
+    assert client.acts_by_itself

@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from math import cos, dist, inf, sin
 
-from companion.core.formation import Slots, assign
+from companion.core.assignment import assign
+from companion.core.formation import Slots
 from companion.core.frames import Ned
 from companion.core.trajectory.fleet import PADS, FleetTrajectory, Then
 from companion.core.trajectory.goto import goto_leg
@@ -59,7 +60,7 @@ def with_formation(
 ) -> FleetTrajectory:
     """The motion that takes over from `motion` at `at_ns` with its vehicles moving to other slots.
 
-    Each vehicle's next slot is assigned from the slots it is in at `at_ns`, both nominal (`formation.assign`);
+    Each vehicle's next slot is assigned from the slots it is in at `at_ns`, both nominal (`assignment.assign`);
     `pinned` names the slots of vehicles that always take the same. The legs go on as they were.
     """
     m = motion.state_at(at_ns).blend[0]
@@ -137,10 +138,10 @@ def over_the_pads(motion: FleetTrajectory, home: FleetTrajectory) -> bool:
 def assignment_matches(motion: FleetTrajectory, slots: Slots, pinned: Mapping[int, int]) -> bool:
     """Whether a received motion's slots are what this vehicle assigns from its own configuration; else refused."""
     ids = sorted(motion.slots)
+    if len(slots) != len(ids):
+        return False
     order = assign([motion.slots[i].before for i in ids], slots, _rows(ids, pinned))
-    return len(slots) == len(ids) and all(
-        dist(motion.slots[i].after, slots[k]) < 1e-3 for i, k in zip(ids, order, strict=True)
-    )
+    return all(dist(motion.slots[i].after, slots[k]) < 1e-3 for i, k in zip(ids, order, strict=True))
 
 
 def _rows(ids: Sequence[int], pinned: Mapping[int, int]) -> dict[int, int]:

@@ -1,6 +1,5 @@
 """Everything that is known of one flight, read from its companions' recordings."""
 
-import json
 import struct
 from collections import Counter
 from collections.abc import Iterable, Mapping
@@ -12,14 +11,13 @@ import numpy as np
 import numpy.typing as npt
 
 from companion.config import FleetConfig
-from companion.core.counts import Refusal
 from companion.core.events import Event, MotionAdopted
 from companion.core.trajectory.fleet import FleetTrajectory
 from companion.core.trajectory.history import TrajectoryHistory
 from companion.errors import WireError
 from companion.io.recorder import Entry, RecordingError, read_recording
 from companion.io.records import TickRecord, TrafficRecord
-from companion.vehicle.orders import Order, read_order
+from companion.wire import operator as protocol
 from companion.wire.events import decode_event
 from companion.wire.peer import encode_motion
 
@@ -52,7 +50,7 @@ class Command:
 
     time_ns: int
     """when the first vehicle had it"""
-    order: Order
+    order: protocol.Command
     accepted: list[int] = field(default_factory=list)
     refused: dict[int, str] = field(default_factory=dict)
     """vehicle -> why"""
@@ -145,8 +143,9 @@ class Flight:
         return None
 
     def _command(self, time_ns: int, vehicle_id: int, payload: bytes) -> Command | None:
-        order = read_order(payload, vehicle_id)
-        if isinstance(order, Refusal):
+        try:
+            order = protocol.decode_command(payload)
+        except WireError:
             self.commands_unread += 1
             return None
         command = self.commands.setdefault(payload, Command(time_ns, order))
@@ -182,8 +181,8 @@ def _answer(command: Command, vehicle_id: int, body: bytes) -> None:
     if vehicle_id not in command.unanswered:
         return
     command.unanswered.remove(vehicle_id)
-    said = json.loads(body)
-    if said["accepted"]:
+    said = protocol.decode(protocol.Answer, body)
+    if said.accepted:
         command.accepted.append(vehicle_id)
     else:
-        command.refused[vehicle_id] = said["reason"]
+        command.refused[vehicle_id] = said.reason or ""

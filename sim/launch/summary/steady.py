@@ -7,11 +7,11 @@ import numpy as np
 import numpy.typing as npt
 
 from companion.core.events import PhaseChanged
-from companion.core.monitor import algebraic_connectivity, centroid_error_m, formation_error_m, velocity_error_m_s
 from companion.core.trajectory.history import TrajectoryHistory
 from companion.core.values import Phase
 from sim.launch.summary.flight import Array, Flight
 from sim.launch.summary.numbers import rounded
+from sim.measures import algebraic_connectivity, centroid_error_m, formation_error_m, velocity_error_m_s
 
 SETTLING_S = 3.0
 """left out of the steady part after forming and after a change of formation"""
