@@ -207,14 +207,6 @@ def sitl(
     SitlHost(config, settings).run(grace_s=1.5)
 
 
-@app.command(hidden=True)
-def reference_loop(out: Annotated[Path, typer.Option()]) -> None:
-    """An empty 50 Hz loop, to measure the machine beside a flight; ends when standard input closes."""
-    from sim.launch.reference_loop import run_reference_loop
-
-    run_reference_loop(out, sys.stdin.fileno())
-
-
 @app.command()
 def study(
     name: Annotated[
