@@ -111,16 +111,9 @@ def up(
     with only_flight(config.fleet.name):
         refuse_companions(config)
         options = FlightOptions(
-            flight_folder(out),
-            seed,
-            duration,
-            px4,
-            tuple(parameter or ()),
-            autopilot == "external",
-            gcs,
-            faults,
+            flight_folder(out), seed, duration, px4, tuple(parameter or ()), autopilot == "external", gcs, faults,
             allow_missing,
-        )
+        )  # fmt: skip
         with FlightView(quiet=as_json) as view:
             summary = fly(tables, options, view.show, interrupted, lambda line: typer.echo(line, err=True))
     if as_json:
@@ -212,14 +205,6 @@ def sitl(
     parameters = parse_parameters(parameter or ())
     settings = SitlSettings(check_build(px4), truth.parent, truth, sys.stdin.fileno(), parameters, ready)
     SitlHost(config, settings).run(grace_s=1.5)
-
-
-@app.command(hidden=True)
-def reference_loop(out: Annotated[Path, typer.Option()]) -> None:
-    """An empty 50 Hz loop, to measure the machine beside a flight; ends when standard input closes."""
-    from sim.launch.reference_loop import run_reference_loop
-
-    run_reference_loop(out, sys.stdin.fileno())
 
 
 @app.command()

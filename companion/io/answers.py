@@ -1,45 +1,30 @@
 """The operator's questions, answered by the vehicle's loop once what cannot wait is done."""
 
 from collections.abc import Callable
-from dataclasses import replace
-from typing import NamedTuple
 
 from companion.core.values import Instant
 from companion.io.clock import FleetClock
 from companion.io.transport import Request
 from companion.vehicle.guard import Guard
-from companion.wire.operator import CLOCK_QUESTION, ClockReading, encode
+from companion.wire.operator import CLOCK_QUESTION, ClockReading, Status, encode
 
 STATUS_LASTS_NS = 50_000_000
 """a status this old is told again: making one takes a good part of a control period; a command makes it anew"""
 
 
-class ProcessFacts(NamedTuple):
-    """What a status says beyond what the agent knows of itself."""
-
-    lateness_ms: float
-    """of the last control tick"""
-    dropped: int
-    """messages of peers for which there was no room"""
-    recorder_lost: int
-    """entries missing in the recording"""
-    rejected: dict[str, int]
-    """inputs that did not reach the agent, by kind"""
-
-
 class Answers:
-    """`process_facts` are what a status says of the process around the agent."""
+    """`complete` adds to a status what the process around the agent knows."""
 
     def __init__(
         self,
         guard: Guard,
         clock: FleetClock,
-        process_facts: Callable[[], ProcessFacts],
+        complete: Callable[[Status], Status],
         record: Callable[[str, Instant, bytes], None],
     ) -> None:
         self._guard = guard
         self._clock = clock
-        self._process_facts = process_facts
+        self._complete = complete
         self._record = record
         self._status: bytes | None = None
         self._status_ns = 0
@@ -69,8 +54,7 @@ class Answers:
             return encode(agent.operator.preflight_report(now))
         received_ns = self._clock.at(request.received_monotonic_ns).fleet_ns
         answered_ns = self._clock.now().fleet_ns
-        reading = ClockReading(boot_id=agent.boot_id, received_ns=received_ns, answered_ns=answered_ns)
-        return encode(reading)
+        return encode(ClockReading(boot_id=agent.boot_id, received_ns=received_ns, answered_ns=answered_ns))
 
     def _recent_status(self, now: Instant) -> bytes | None:
         if self._status is None or now.monotonic_ns - self._status_ns > STATUS_LASTS_NS:
@@ -79,8 +63,4 @@ class Answers:
         return self._status
 
     def _make_status(self, now: Instant) -> bytes:
-        status = self._guard.agent.status(now)
-        facts = self._process_facts()
-        raised = {f"raised: {kind}": count for kind, count in self._guard.raised.items()}
-        rejected = status.rejected | facts.rejected | raised
-        return encode(replace(status, **{**facts._asdict(), "rejected": rejected}))
+        return encode(self._complete(self._guard.agent.status(now)))

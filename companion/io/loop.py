@@ -14,7 +14,7 @@ import socket
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from companion.config import FleetConfig
 from companion.core.failsafe import CONFIGURATION_S, Failsafe
 from companion.core.values import Instant
 from companion.errors import CompanionError
-from companion.io.answers import Answers, ProcessFacts
+from companion.io.answers import Answers
 from companion.io.clock import FleetClock
 from companion.io.link import open_link
 from companion.io.network import peer_transport
@@ -34,6 +34,7 @@ from companion.vehicle.agent import Agent
 from companion.vehicle.guard import Guard
 from companion.vehicle.outputs import Outputs
 from companion.wire.events import encode_event
+from companion.wire.operator import Status
 
 SAFE, STILL_FLYING, LOST = 0, 3, 4
 """exit statuses: landed or landing by its autopilot; ended without a confirmed landing; ticks do nothing but raise"""
@@ -70,7 +71,7 @@ class Companion:
         self.agent = Agent(config, settings.vehicle_id, secrets.randbits(32))
         self.guard = Guard(self.agent)
         self.clock = FleetClock()
-        self.answers = Answers(self.guard, self.clock, self._process_facts, self._record)
+        self.answers = Answers(self.guard, self.clock, self._complete, self._record)
         self.recorder: Recorder | None = None
         self.lateness_ns = 0
         """of the last tick"""
@@ -310,17 +311,20 @@ class Companion:
         except OSError:
             return None
 
-    def _process_facts(self) -> ProcessFacts:
-        """What a status says beyond what the agent knows of itself."""
+    def _complete(self, status: Status) -> Status:
+        """The agent's account with what the process around it knows."""
         counters = self.network.counters
         elsewhere = {
             "mavlink: another address than the autopilot's": self.link.foreign_datagrams,
             "mavlink: could not be sent": self.link.send_failures,
             "peer: malformed": counters.malformed,
         }
-        return ProcessFacts(
+        rejected = {kind: count for kind, count in elsewhere.items() if count}
+        rejected |= {f"raised: {kind}": count for kind, count in self.guard.raised.items()}
+        return replace(
+            status,
+            rejected=status.rejected | rejected,
             lateness_ms=self.lateness_ns * 1e-6,
             dropped=counters.dropped,
             recorder_lost=0 if self.recorder is None else self.recorder.lost,
-            rejected={kind: count for kind, count in elsewhere.items() if count},
         )

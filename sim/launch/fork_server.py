@@ -1,7 +1,7 @@
 """Starts a fleet's processes: imports once, freezes, and forks; `python -m sim.launch.fork_server SOCKET ROOM`.
 
-A companion of its own interpreter costs half a second of CPU and 60 MB, nearly all for the same imports. Here each is a
-fork of one process that has done them, and runs the very command that a user would: `companion run ...`.
+A companion in an interpreter of its own spends most of its start, and most of its memory, on the same imports and the
+same file. Here each is a fork of one process that has them, and runs what `companion run` runs (`jobs`).
 
 Nothing opens a network or starts a thread before the fork: neither survives one. A forked process takes the place of
 one that was started: a session, standard files, a title for `ps` and a niceness of its own. It is an orphan at once and
@@ -25,37 +25,24 @@ import threading
 import time
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
 
+from companion.errors import CompanionError
+from sim.launch.jobs import LIFELINE, FleetFiles, Job, decode
 from sim.launch.linux import show_as, signal_at_parents_death
 
 END_WITHIN_S = 1.6
+USAGE_ERROR = 2
 ABANDONED = 70
 """exit status of a process that did not finish by itself"""
-PRELOADED = (
-    "companion.__main__", "companion.io.process", "companion.io.zenoh.vehicle",
-    "sim.__main__", "sim.autopilot.stub_fleet", "sim.autopilot.stubs", "sim.launch.reference_loop",
-)  # fmt: skip
-"""what the forked commands import when they run"""
+PRELOADED = ("companion.io.zenoh.vehicle",)
+"""what the jobs import when they run, and not before"""
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 """environment of the server: numeric libraries start their threads when they are imported"""
 MESSAGE_MAX_BYTES = 65_536
 
 
-class Job(NamedTuple):
-    """One process to be started. Its standard input and its log come as file descriptors beside it."""
-
-    command: list[str]
-    """package and arguments: ["companion", "run", ...]"""
-    niceness: int = 0
-
-    def encode(self) -> bytes:
-        """For the server's socket."""
-        return json.dumps(self._asdict()).encode()
-
-
-def serve(control: socket.socket) -> Job | None:
-    """Fork for every job that comes; None once the launcher is gone.
+def serve(control: socket.socket, files: FleetFiles) -> Job | None:
+    """Fork for every job that comes, with its standard input and its log beside it; None once the launcher is gone.
 
     Returns the job in the forked process, far from the server's frames, to be run there.
     """
@@ -63,17 +50,21 @@ def serve(control: socket.socket) -> Job | None:
         message, fds, flags, _ = socket.recv_fds(control, MESSAGE_MAX_BYTES, 2)
         if not message:
             return None
-        job = Job(**json.loads(message))
+        job, niceness = decode(message)
         try:
             if len(fds) < 2 or flags & socket.MSG_CTRUNC:
                 raise OSError(0, "too many open files in the companions' server")
+            if job.fleet is not None:
+                files.read(Path(job.fleet))
             pid = _fork_orphan()
+        except CompanionError as error:
+            answer: dict[str, object] = {"error": str(error)}
         except OSError as error:
-            answer: dict[str, object] = {"error": error.strerror}
+            answer = {"error": error.strerror}
         else:
             if pid == 0:
                 control.close()
-                _take_place(job, *fds)
+                _take_place(job.title, niceness, *fds)
                 return job
             answer = {"pid": pid}
         for fd in fds:
@@ -111,7 +102,7 @@ def _fork_orphan() -> int:
             os.close(writing)
 
 
-def _take_place(job: Job, lifeline: int, log: int) -> None:
+def _take_place(title: list[str], niceness: int, lifeline: int, log: int) -> None:
     """Become the job's process in all that exec would have set."""
     os.setsid()
     signal_at_parents_death(signal.SIGCONT)
@@ -119,12 +110,12 @@ def _take_place(job: Job, lifeline: int, log: int) -> None:
         os.dup2(fd, standard)
     for fd in (lifeline, log):
         os.close(fd)
-    if job.niceness:
-        os.setpriority(os.PRIO_PROCESS, 0, job.niceness)
+    if niceness:
+        os.setpriority(os.PRIO_PROCESS, 0, niceness)
         # Where the kernel groups processes by session, niceness counts within a group only, and each group has its own.
         with suppress(OSError):
-            Path("/proc/self/autogroup").write_text(str(job.niceness))
-    show_as(job.command)
+            Path("/proc/self/autogroup").write_text(str(niceness))
+    show_as(title)
 
 
 def _watch(fd: int) -> None:
@@ -148,12 +139,17 @@ def main() -> None:
         sys.stderr.flush()
     gc.collect()
     gc.freeze()
-    job = serve(control)
+    files = FleetFiles()
+    job = serve(control, files)
     if job is None:
         return
-    threading.Thread(target=_watch, args=(0,), name="launcher watch", daemon=True).start()
-    sys.argv = list(job.command)
-    sys.modules[f"{job.command[0]}.__main__"].main()
+    threading.Thread(target=_watch, args=(LIFELINE,), name="launcher watch", daemon=True).start()
+    try:
+        status = job.run(files)
+    except CompanionError as error:
+        sys.stderr.write(f"{job.program}: {error}\n")
+        status = USAGE_ERROR
+    sys.exit(status)
 
 
 if __name__ == "__main__":

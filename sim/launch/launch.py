@@ -22,6 +22,7 @@ from companion.io.network import operator_link
 from companion.operator.client import Operator
 from sim.autopilot.stubs import TRUTH_DTYPE
 from sim.launch.faults import ScheduledFault
+from sim.launch.jobs import CompanionJob, ReferenceJob, StubsJob
 from sim.launch.processes import END_TIMEOUT_S, FleetProcesses
 from sim.launch.reference_loop import read_reference_loop
 from sim.launch.summary.flight import Flight
@@ -152,7 +153,7 @@ class _Launch:
 
     def _start_autopilots(self) -> None:
         options, file = self.options, str(self._file)
-        self.processes.fork("reference", "sim", "reference-loop", "--out", str(options.folder / "reference.bin"))
+        self.processes.fork("reference", ReferenceJob(str(options.folder / "reference.bin")))
         if options.px4 is not None:
             more = [word for p in options.parameters for word in ("--parameter", p)]
             self.processes.spawn(
@@ -160,19 +161,14 @@ class _Launch:
                 "--ready", str(self._ready), *more,
             )  # fmt: skip
         elif not options.external:
-            self.processes.fork(
-                "autopilots", "sim", "stub", "--fleet", file, "--seed", str(options.seed), "--truth", str(self._truth),
-                "--launched", *(["--gcs"] if options.ground else []),
-            )  # fmt: skip
+            self.processes.fork("autopilots", StubsJob(file, options.seed, str(self._truth), options.ground))
 
     def _start_companions(self, ids: list[int]) -> None:
         for i in ids:
             if self.interrupted():
                 raise CompanionError("interrupted before take-off")
-            self.processes.fork(
-                f"companion-{i}", "companion", "run", "--vehicle", str(i), "--fleet", str(self._file), "--record",
-                str(self._recording(i)), "--launched", niceness=CROWD_NICENESS if len(ids) > CROWD else 0,
-            )  # fmt: skip
+            job = CompanionJob(i, str(self._file), str(self._recording(i)))
+            self.processes.fork(f"companion-{i}", job, CROWD_NICENESS if len(ids) > CROWD else 0)
 
     def _recording(self, vehicle_id: int) -> Path:
         return self.options.folder / f"vehicle-{vehicle_id}.mcap"

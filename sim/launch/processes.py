@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Protocol
 
 from companion.errors import CompanionError
-from sim.launch.fork_server import ONE_THREAD, Job
+from sim.launch.fork_server import ONE_THREAD
+from sim.launch.jobs import Job, encode
 from sim.launch.linux import adopt_orphans
 
 END_TIMEOUT_S = 5.0
@@ -81,10 +82,10 @@ class ForkServer:
                 pass_fds=[theirs.fileno()], env={**os.environ, **ONE_THREAD},
             )  # fmt: skip
 
-    def start(self, job: Job, lifeline: int, log: int) -> Forked:
+    def start(self, job: Job, niceness: int, lifeline: int, log: int) -> Forked:
         """Fork a process for a job; CompanionError says why there is none."""
         try:
-            socket.send_fds(self._control, [job.encode()], [lifeline, log])
+            socket.send_fds(self._control, [encode(job, niceness)], [lifeline, log])
             answer = self._control.recv(4096)
         except TimeoutError:
             raise CompanionError(f"the companions' server has not answered for {SERVER_TIMEOUT_S:.0f} s") from None
@@ -134,12 +135,12 @@ class FleetProcesses:
         self._server = ForkServer(self.folder / "server.log")
         self._stack.callback(self._server.close)
 
-    def fork(self, name: str, *command: str, niceness: int = 0) -> None:
-        """Start a command of a package from the server, with its output in NAME.log."""
+    def fork(self, name: str, job: Job, niceness: int = 0) -> None:
+        """Start a job from the server, with its output in NAME.log."""
         assert self._server is not None
         try:
             with (self.folder / f"{name}.log").open("wb") as log:
-                self.children[name] = self._server.start(Job([*command], niceness), self._lifeline, log.fileno())
+                self.children[name] = self._server.start(job, niceness, self._lifeline, log.fileno())
         except (CompanionError, OSError) as error:
             raise CompanionError(f"{name} cannot be started: {error}") from error
 

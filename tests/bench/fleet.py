@@ -25,10 +25,14 @@ import typer
 
 from companion.config import FleetConfig, load
 from companion.io.network import operator_link
+from sim.launch.jobs import CompanionJob, StubsJob
+from sim.launch.launch import CROWD, CROWD_NICENESS
 from sim.launch.processes import FleetProcesses, Forked
 
 ROOT = Path(__file__).resolve().parents[2]
 CONTROL_RATE_HZ = 50
+CROWD_RATE_HZ = 20.0
+"""of the fifty that are started: as `fleet up` has them"""
 TIMEOUT_S = 120.0
 SETTLE_S = 3.0
 """after the last is up: what each takes is read then"""
@@ -60,22 +64,24 @@ def cpu_s(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
+def niceness(config: FleetConfig) -> int:
+    """As the launcher's."""
+    return CROWD_NICENESS if len(config.vehicles) > CROWD else 0
+
+
 def start_forked(config: FleetConfig, file: Path, processes: FleetProcesses) -> None:
     """As `fleet up` does."""
-    processes.fork("stubs", "sim", "stub", "--fleet", str(file), "--launched")
+    processes.fork("stubs", StubsJob(str(file)))
     for v in config.vehicles:
-        processes.fork(
-            f"companion-{v.id}", "companion", "run", "--vehicle", str(v.id), "--fleet", str(file), "--launched"
-        )
+        processes.fork(f"companion-{v.id}", CompanionJob(v.id, str(file)), niceness(config))
 
 
 def start_alone(config: FleetConfig, file: Path, processes: FleetProcesses) -> None:
     """Each with imports of its own."""
     processes.spawn("stubs", "sim", "stub", "--fleet", str(file), "--launched")
     for v in config.vehicles:
-        processes.spawn(
-            f"companion-{v.id}", "companion", "run", "--vehicle", str(v.id), "--fleet", str(file), "--launched"
-        )
+        job = CompanionJob(v.id, str(file))
+        processes.spawn(f"companion-{v.id}", *job.title)
 
 
 @contextmanager
@@ -97,7 +103,7 @@ def start(
     """Start companions against stubs: seconds until each is seen and answers, memory and CPU of each."""
     with TemporaryDirectory() as name:
         folder = Path(name)
-        file = write_fleet(folder, vehicles)
+        file = write_fleet(folder, vehicles, control_rate_hz=CROWD_RATE_HZ)
         config = load(file)
         ids = [v.id for v in config.vehicles]
         began_s = time.monotonic()

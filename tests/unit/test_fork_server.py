@@ -17,6 +17,7 @@ import pytest
 
 from companion.errors import CompanionError
 from sim.launch.fork_server import ABANDONED, END_WITHIN_S
+from sim.launch.jobs import CompanionJob, FleetFiles, ReferenceJob, StubsJob, decode, encode
 from sim.launch.processes import FleetProcesses, Forked, how_it_ended
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -57,7 +58,7 @@ def processes(tmp_path: Path) -> Iterator[FleetProcesses]:
 def idle(processes: FleetProcesses, name: str = "idle", niceness: int = 0) -> Forked:
     """A process that does nothing but write a line of a file every 20 ms."""
     file = processes.folder / f"{name}.bin"
-    processes.fork(name, "sim", "reference-loop", "--out", str(file), niceness=niceness)
+    processes.fork(name, ReferenceJob(str(file)), niceness)
     child = processes.children[name]
     assert isinstance(child, Forked)
     assert eventually(lambda: child.poll() is not None or file.exists())
@@ -88,7 +89,7 @@ def test_a_forked_process_is_ours_and_what_an_executed_one_would_be(processes: F
     assert int(parent) == os.getpid()
     assert int(session) == child.pid
     assert os.getpriority(os.PRIO_PROCESS, child.pid) == NICENESS
-    assert cmdline(child.pid) == f"sim reference-loop --out {processes.folder / 'idle.bin'}"
+    assert cmdline(child.pid) == f"fleet reference loop {processes.folder / 'idle.bin'}"
     links = {int(e.name): os.readlink(e) for e in Path(f"/proc/{child.pid}/fd").iterdir()}
     assert links[1] == links[2] == str(processes.folder / "idle.log")
     assert links[0].startswith("pipe:")
@@ -106,13 +107,38 @@ def test_how_a_process_ended_is_known_by_status_and_by_the_signals_name(processe
     os.kill(child.pid, signal.SIGKILL)
     assert eventually(lambda: processes.exit_status("idle") == -signal.SIGKILL)
     assert processes.why_ended("idle", "in flight") == "idle ended in flight with status -9 (SIGKILL):"
-    processes.fork("wrong", "companion", "run", "--vehicle", "1", "--fleet", "nowhere.toml")
+    processes.fork("wrong", CompanionJob(99, str(ROOT / "fleet.toml")))
     assert eventually(lambda: processes.exit_status("wrong") == 2)
     assert processes.why_ended("wrong", "before take-off") == (
-        "wrong ended before take-off with status 2:\ncompanion: nowhere.toml: cannot be read: No such file or directory"
+        "wrong ended before take-off with status 2:\ncompanion: vehicle 99 is not an enabled vehicle of this fleet; "
+        "there are 1, 2, 3, 4, 5, 6, 7, 8, 9, 10"
     )
     assert how_it_ended(-11) == "status -11 (SIGSEGV)"
     assert how_it_ended(-200) == "status -200"
+
+
+def test_a_file_that_no_vehicle_could_fly_by_is_refused_before_there_is_a_process(processes: FleetProcesses) -> None:
+    with pytest.raises(CompanionError, match=r"^lost cannot be started: nowhere\.toml: cannot be read: No such file"):
+        processes.fork("lost", CompanionJob(1, "nowhere.toml"))
+
+
+def test_a_file_that_has_changed_is_read_anew_and_else_once(tmp_path: Path) -> None:
+    file, files = tmp_path / "fleet.toml", FleetFiles()
+    text = (ROOT / "fleet.toml").read_text()
+    file.write_text(text)
+    told, config = files.read(file)
+    assert told == text
+    assert files.read(file)[1] is config
+    file.write_text(text.replace('name = "starling"', 'name = "other"'))
+    assert files.read(file)[1].fleet.name == "other"
+    file.write_text("nonsense")
+    with pytest.raises(CompanionError):
+        files.read(file)
+
+
+def test_every_job_survives_the_servers_socket() -> None:
+    for job in (CompanionJob(3, "f.toml", "r.mcap"), StubsJob("f.toml", 7, "t.bin", True), ReferenceJob("out")):
+        assert decode(encode(job, 5)) == (job, 5)
 
 
 def test_ending_ends_a_stopped_process_too(processes: FleetProcesses) -> None:
@@ -128,7 +154,7 @@ def test_without_its_server_a_process_lives_on_and_its_end_is_known(processes: F
     child = idle(processes)
     os.kill(server_pid(processes), signal.SIGKILL)
     with pytest.raises(CompanionError, match=r"late cannot be started: .*server ended with status -9 \(SIGKILL\)"):
-        processes.fork("late", "sim", "reference-loop", "--out", str(processes.folder / "late.bin"))
+        processes.fork("late", ReferenceJob(os.devnull))
     assert child.poll() is None
     processes.end(["idle"], 5.0)
     assert child.poll() == -signal.SIGTERM
@@ -143,7 +169,7 @@ def test_a_server_that_cannot_take_more_files_says_so_and_goes_on(processes: Fle
         limit = next(n for n in range(1024) if n - len([fd for fd in open_files if fd < n]) == free)
         resource.prlimit(pid, resource.RLIMIT_NOFILE, (limit, before[1]))
         with pytest.raises(CompanionError, match=r"crowded cannot be started: .*[Tt]oo many open files"):
-            processes.fork("crowded", "sim", "reference-loop", "--out", os.devnull)
+            processes.fork("crowded", ReferenceJob(os.devnull))
     resource.prlimit(pid, resource.RLIMIT_NOFILE, before)
     idle(processes, "again")
 
@@ -151,11 +177,12 @@ def test_a_server_that_cannot_take_more_files_says_so_and_goes_on(processes: Fle
 LAUNCHER = """
 import sys, time
 from pathlib import Path
+from sim.launch.jobs import ReferenceJob
 from sim.launch.processes import FleetProcesses
 processes = FleetProcesses(Path(sys.argv[1]))
 processes.open()
 for name in sys.argv[2:]:
-    processes.fork(name, "sim", "reference-loop", "--out", str(processes.folder / f"{name}.bin"))
+    processes.fork(name, ReferenceJob(str(processes.folder / f"{name}.bin")))
 print(*(c.pid for c in processes.children.values()), processes._server.process.pid, flush=True)
 time.sleep(600)
 """
@@ -218,18 +245,18 @@ def test_a_process_that_hangs_is_gone_in_time_without_its_launcher() -> None:
 
 FULL = """
 import os, pwd, resource, socket, sys
-from sim.launch import fork_server
+from sim.launch import fork_server, jobs
 control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
 server = os.fork()
 if server == 0:
     control.close()
     os.setuid(pwd.getpwnam("nobody").pw_uid)
     resource.setrlimit(resource.RLIMIT_NPROC, (int(sys.argv[1]),) * 2)
-    fork_server.serve(theirs)
+    fork_server.serve(theirs, jobs.FleetFiles())
     os._exit(0)
 theirs.close()
 for _ in range(2):
-    socket.send_fds(control, [fork_server.Job(["sim"]).encode()], [0, 1])
+    socket.send_fds(control, [jobs.encode(jobs.ReferenceJob("/dev/null"), 0)], [0, 1])
     print(control.recv(4096).decode())
 control.close()
 print(os.waitpid(server, 0)[1])

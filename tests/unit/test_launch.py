@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -120,14 +120,14 @@ def coming(third: Callable[[float], Status | None]) -> Callable[[float], Said]:
 
 def unheard() -> Status:
     """A companion that has heard no autopilot yet."""
-    return statuses.status(phase="idle", armed=True, autopilot_age_s=None, ready=["no heartbeat from the autopilot"])
+    return replace(status("idle"), autopilot_age_s=None, ready=["no heartbeat from the autopilot"])
 
 
 @pytest.mark.parametrize(
     ("third", "why"), [(None, "its companion does not answer"), (unheard(), "its autopilot is not heard")]
 )
 def test_who_does_not_come_is_named_once_within_fifteen_seconds_and_waited_for(
-    tmp_path: Path, third: dict[str, Any] | None, why: str
+    tmp_path: Path, third: Status | None, why: str
 ) -> None:
     fleet = Fleet(tmp_path, coming(lambda now_s: third if now_s < 40.0 else status("idle")))
     assert fleet.watch().take_off(120.0, lambda: False).all_accepted
