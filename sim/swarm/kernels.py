@@ -714,48 +714,65 @@ def look(i: int, k: int, own: Floats, common: Ned, s: State, ref: Floats, o: Opt
     range2 = o.range_m * o.range_m
     gated = t >= o.gates_after
     mx, my = _gates(i, s, o) if gated else (0.0, 0.0)
+    somebody_lost = t >= o.fault_step * o.dt + o.presence_delay
     several = ref.shape[1] > 1
-    near, predicted, column = s.near, s.predicted, s.column
+    w0, w1, w2, a0, a1, a2 = ref[k, 0, 3], ref[k, 0, 4], ref[k, 0, 5], ref[k, 0, 6], ref[k, 0, 7], ref[k, 0, 8]
+    near, near_row, predicted, column, truth, held_step = s.near, s.near_row, s.predicted, s.column, s.x, s.held_step
+    stopped, q0, q1 = s.stopped, s.measured[i, 0], s.measured[i, 1]
+    begin, end, uncertainty, links = s.start[i], s.start[i + 1], o.uncertainty, o.links == 1
     x, y, z = own[0], own[1], own[2]
     if o.range_on_truth == 1:
-        x, y, z = s.x[i, 0], s.x[i, 1], s.x[i, 2]
+        x, y, z = truth[i, 0], truth[i, 1], truth[i, 2]
     d0, d1, d2 = s.slot[i, 0], s.slot[i, 1], s.slot[i, 2]
+    # First who is within range, without a branch, which would be guessed wrong for one in four.
     count = 0
-    for e in range(s.start[i], s.start[i + 1]):
-        j = column[e]
-        r = e if o.links == 1 else j
-        m = j if several else 0
-        if o.links == 1 and s.held_step[e] == NEVER:
-            continue
-        # Every value is read before the first is written: the compiler cannot know that the arrays are apart.
+    if o.range_on_truth == 1:
+        for e in range(begin, end):
+            j = column[e]
+            ex, ey, ez = x - truth[j, 0], y - truth[j, 1], z - truth[j, 2]
+            near_row[count] = e
+            count += 1 if ex * ex + ey * ey + ez * ez <= range2 and not (links and held_step[e] == NEVER) else 0
+    elif links:
+        for e in range(begin, end):
+            ex, ey, ez = x - predicted[e, 0], y - predicted[e, 1], z - predicted[e, 2]
+            near_row[count] = e
+            count += 1 if ex * ex + ey * ey + ez * ez <= range2 and held_step[e] != NEVER else 0
+    else:
+        for e in range(begin, end):
+            j = column[e]
+            ex, ey, ez = x - predicted[j, 0], y - predicted[j, 1], z - predicted[j, 2]
+            near_row[count] = e
+            count += 1 if ex * ex + ey * ey + ez * ez <= range2 else 0
+    for q in range(count):
+        r = near_row[q] if links else column[near_row[q]]
         p0, p1, p2 = predicted[r, 0], predicted[r, 1], predicted[r, 2]
-        ex, ey, ez = x - p0, y - p1, z - p2
-        if o.range_on_truth == 1:
-            ex, ey, ez = x - s.x[j, 0], y - s.x[j, 1], z - s.x[j, 2]
-        if ex * ex + ey * ey + ez * ez > range2:
-            continue
         v0, v1, v2 = predicted[r, 3], predicted[r, 4], predicted[r, 5]
         o0, o1, o2 = d0 - predicted[r, 6], d1 - predicted[r, 7], d2 - predicted[r, 8]
-        w0, w1, w2 = ref[k, m, 3], ref[k, m, 4], ref[k, m, 5]
-        a0, a1, a2 = ref[k, m, 6], ref[k, m, 7], ref[k, m, 8]
-        lost = j == o.fault_agent and t >= o.fault_step * o.dt + o.presence_delay
-        apart = lost
-        if gated:
-            q0, q1 = s.measured[i, 0], s.measured[i, 1]
-            apart = lost or is_outlier(v0 - w0, v1 - w1, q0 - p0 - o0 - mx, q1 - p1 - o1 - my)
+        near[q, 0], near[q, 1], near[q, 2] = p0, p1, p2
+        near[q, 3], near[q, 4], near[q, 5] = v0, v1, v2
+        near[q, 6], near[q, 7], near[q, 8] = o0, o1, o2
+        near[q, 9], near[q, 10], near[q, 11], near[q, 12] = 1.0, 1.0, uncertainty, 0.0
+        near[q, 16], near[q, 17], near[q, 18] = w0, w1, w2
+        near[q, 19], near[q, 20], near[q, 21] = a0, a1, a2
+    if not (several or gated or somebody_lost or o.leaderless == 1):
+        return count
+    for q in range(count):
+        e = near_row[q]
+        j = column[e]
+        if several:
+            near[q, 16], near[q, 17], near[q, 18] = ref[k, j, 3], ref[k, j, 4], ref[k, j, 5]
+            near[q, 19], near[q, 20], near[q, 21] = ref[k, j, 6], ref[k, j, 7], ref[k, j, 8]
+        if gated and is_outlier(
+            near[q, 3] - near[q, 16], near[q, 4] - near[q, 17],
+            q0 - near[q, 0] - near[q, 6] - mx, q1 - near[q, 1] - near[q, 7] - my,
+        ):  # fmt: skip
+            near[q, 9] = 0.0
         if o.leaderless == 1:
-            w0, w1, w2 = common.north, common.east, common.down
-        near[count, 0], near[count, 1], near[count, 2] = p0, p1, p2
-        near[count, 3], near[count, 4], near[count, 5] = v0, v1, v2
-        near[count, 6], near[count, 7], near[count, 8] = o0, o1, o2
-        near[count, 9], near[count, 10] = 0.0 if apart else 1.0, 0.0 if lost else 1.0
-        near[count, 11], near[count, 12] = o.uncertainty, 1.0 if lost else 0.0
-        if lost:
-            near[count, 13], near[count, 14], near[count, 15] = s.stopped[r, 0], s.stopped[r, 1], s.stopped[r, 2]
-        near[count, 16], near[count, 17], near[count, 18] = w0, w1, w2
-        near[count, 19], near[count, 20], near[count, 21] = a0, a1, a2
-        s.near_row[count] = e
-        count += 1
+            near[q, 16], near[q, 17], near[q, 18] = common.north, common.east, common.down
+        if somebody_lost and j == o.fault_agent:
+            r = e if links else j
+            near[q, 9], near[q, 10], near[q, 12] = 0.0, 0.0, 1.0
+            near[q, 13], near[q, 14], near[q, 15] = stopped[r, 0], stopped[r, 1], stopped[r, 2]
     return count
 
 
