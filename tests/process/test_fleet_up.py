@@ -44,6 +44,7 @@ from fleet_process import (
     truth,
     wait_status,
 )
+from pymavlink.dialects.v20 import development as dialect
 
 from companion.__main__ import main as companion_main
 from companion.core.events import KillCause
@@ -60,9 +61,9 @@ from companion.io.zenoh.configuration import (
     zenoh_configuration,
 )
 from companion.operator.client import Operator
-from companion.wire.mavlink import Px4Mode, dialect
 from companion.wire.operator import Status
 from companion.wire.peer import encode_state
+from companion.wire.px4 import Px4Mode
 from sim.__main__ import main as fleet_main
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(400)]

@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from fleet_process import Fleet, Process, flight_folder, make_fleet, operator_of, started, wait_status
+from pymavlink.dialects.v20 import development as dialect
 
 from companion.core.trajectory.history import TrajectoryHistory
 from companion.io.recorder import read_recording
 from companion.operator.client import Operator
-from companion.wire.mavlink import Px4Mode, dialect, mode_parameters
+from companion.wire.px4 import Px4Mode, mode_parameters
 from sim.autopilot.stubs import TRUTH_DTYPE
 from sim.launch.summary.flight import Flight as FlightRecord
 

@@ -33,7 +33,9 @@ from companion.vehicle.autopilot.px4_versions import same_setting
 from companion.vehicle.autopilot.requests import STREAM, Requests
 from companion.vehicle.autopilot.round_trips import RoundTrips
 from companion.wire import mavlink as wire
-from companion.wire.mavlink import MavlinkCodec, Px4Mode, mode_name
+from companion.wire import px4
+from companion.wire.mavlink import MavlinkCodec
+from companion.wire.px4 import Px4Mode, mode_name
 
 CLOCK_SAMPLES = 5
 ON_GROUND = 1
@@ -168,10 +170,10 @@ class Px4Autopilot:
 
     def _set_up(self) -> None:
         """Ask for what we read, and for no more: a companion's link may be a serial line."""
-        streams = {**wire.STREAMS_HZ, wire.POSITION_MESSAGE_ID: self.config.limits.control_rate_hz}
-        streams |= dict.fromkeys(wire.STREAMS_OFF, 0.0)
+        streams = {**px4.STREAMS_HZ, px4.POSITION_MESSAGE_ID: self.config.limits.control_rate_hz}
+        streams |= dict.fromkeys(px4.STREAMS_OFF, 0.0)
         for message_id, rate_hz in streams.items():
-            self.requests.ask(f"{STREAM} {message_id}", *wire.interval_parameters(message_id, rate_hz))
+            self.requests.ask(f"{STREAM} {message_id}", *px4.interval_parameters(message_id, rate_hz))
 
     def _position(self, message: wire.LocalPosition, now: Instant) -> bool:
         boot_ms = self.boot.unwrapped(message.boot_ms, now.monotonic_ns)
@@ -220,27 +222,27 @@ class Px4Autopilot:
 
     def arm(self) -> None:
         """Let the motors turn; sent once."""
-        self.requests.ask(REQUESTS[Verb.ARM], *wire.arm_parameters(True), once=True)
+        self.requests.ask(REQUESTS[Verb.ARM], *px4.arm_parameters(True), once=True)
 
     def take_off(self, altitude_amsl_m: float) -> None:
         """Climb; NaN: to PX4's MIS_TAKEOFF_ALT."""
-        self.requests.ask(REQUESTS[Verb.TAKE_OFF], *wire.takeoff_parameters(altitude_amsl_m))
+        self.requests.ask(REQUESTS[Verb.TAKE_OFF], *px4.takeoff_parameters(altitude_amsl_m))
 
     def engage(self) -> None:
         """OFFBOARD, which PX4 enters only while setpoints stream."""
-        self.requests.ask_mode(REQUESTS[Verb.ENGAGE], *wire.mode_parameters(Px4Mode.OFFBOARD))
+        self.requests.ask_mode(REQUESTS[Verb.ENGAGE], *px4.mode_parameters(Px4Mode.OFFBOARD))
 
     def hold(self) -> None:
         """AUTO.LOITER."""
-        self.requests.ask_mode(REQUESTS[Verb.HOLD], *wire.mode_parameters(Px4Mode.AUTO_LOITER))
+        self.requests.ask_mode(REQUESTS[Verb.HOLD], *px4.mode_parameters(Px4Mode.AUTO_LOITER))
 
     def land(self) -> None:
         """AUTO.LAND."""
-        self.requests.ask_mode(REQUESTS[Verb.LAND], *wire.mode_parameters(Px4Mode.AUTO_LAND))
+        self.requests.ask_mode(REQUESTS[Verb.LAND], *px4.mode_parameters(Px4Mode.AUTO_LAND))
 
     def kill(self) -> None:
         """Disarm by force."""
-        self.requests.ask(REQUESTS[Verb.KILL], *wire.kill_parameters())
+        self.requests.ask(REQUESTS[Verb.KILL], *px4.kill_parameters())
 
     def outcome(self, verb: Verb) -> Outcome | None:
         """What came of a verb, once a HEARTBEAT has come that knows of it."""
@@ -271,7 +273,7 @@ class Px4Autopilot:
             return out
         if self._asks_origin and now.monotonic_ns >= self._next_origin_ns:
             self._next_origin_ns = now.monotonic_ns + 1_000_000_000
-            out.append(self.codec.command(*wire.request_message_parameters(wire.ORIGIN_MESSAGE_ID)))
+            out.append(self.codec.command(*px4.request_message_parameters(px4.ORIGIN_MESSAGE_ID)))
         out += self.requests.due()
         if not self.armed:
             out += self._preflight_due(now.monotonic_ns)
@@ -369,7 +371,7 @@ class Px4Autopilot:
 
     def facts(self, now: Instant) -> AutopilotFacts:
         """What preflight judges."""
-        is_px4 = self.kind == wire.AUTOPILOT_PX4
+        is_px4 = self.kind == px4.AUTOPILOT_PX4
         parameters = self.parameters
         return AutopilotFacts(
             heartbeat_age_s=self.heartbeat_age_s(now),
