@@ -13,6 +13,8 @@ FLEETS = ("test_fleet_up.py",)
 """files of tests/process that fly whole fleets: half of the time of all"""
 TOGETHER = ("test_flight.py", "test_faults.py", "test_damaged_recordings.py")
 """files of tests/lockstep whose tests look at flights that they share"""
+COMPILED = ("test_swarm.py", "test_swarm_lockstep.py", "test_study.py")
+"""files of tests/unit that compile the swarm: once for all of them"""
 LANES = 2
 NICENESS = 10
 
@@ -40,6 +42,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.xdist_group(lane))
         elif folder == "lockstep" and name in TOGETHER:
             item.add_marker(pytest.mark.xdist_group(name))
+        elif folder == "unit" and name in COMPILED:
+            item.add_marker(pytest.mark.xdist_group("compiled"))
         (first if real_time else then).append(item)
     # Groups are dealt out in the order of the tests: the lanes first, next what is longest of the rest.
     first.sort(key=lambda item: item.path.name in FLEETS, reverse=True)
