@@ -39,7 +39,7 @@ def test_a_verb_refuses_where_two_companions_answer_as_one_vehicle_and_ends_both
         assert alone.returncode == 0, alone.stderr
         assert f"accepted by 1 (fleet {fleet.config.fleet.name}, companions up for" in alone.stdout
         stack.enter_context(started(*companion, str(other), folder=tmp_path, name="companion-b"))
-        wait_status(operator, lambda _: 1 in operator.doubled)
+        wait_status(operator, lambda _: 1 in operator.roster.doubled)
         for verb in (("land",), ("hold",), ("kill", "--yes"), ("takeoff",)):
             refused = run("sim", *verb, *arguments, folder=tmp_path)
             assert refused.returncode == 1, refused.stdout
