@@ -232,6 +232,34 @@ def study(
     run(name, seeds, out, jobs, setup)
 
 
+law = typer.Typer(no_args_is_help=True, help="Laws, ours and those of installed packages.")
+app.add_typer(law, name="law")
+
+
+@law.callback()
+def _laws() -> None:
+    """Laws, ours and those of installed packages."""
+
+
+@law.command("check")
+def law_check(
+    name: Annotated[str, typer.Argument(help="Its kind, as law.kind in fleet.toml says it.")],
+    fleet: Annotated[Path | None, typer.Option(help="Take the law's parameters from this file.")] = None,
+) -> None:
+    """Look a law over before it flies: finite, the same twice, quick, apart when it sends two head-on.
+
+    Real agents on stub autopilots in lockstep. Exit status: 0 all met, 1 a row is not met, 2 wrong usage, or no law.
+    """
+    from companion.config.file import read_tables
+    from sim.lockstep.law_check import check
+
+    passed = True
+    for row in check(name, {} if fleet is None else read_tables(fleet).get("law", {})):
+        typer.echo(f"{'ok' if row.passed else 'FAULT':5}  {row.name:40}  {row.value:>14}  {row.limit}")
+        passed = passed and row.passed
+    raise typer.Exit(0 if passed else FAILED)
+
+
 verbs.mount(app)
 
 

@@ -1,5 +1,6 @@
 """Replay: the agent on recorded inputs, its outputs compared with the recorded ones."""
 
+import json
 import tomllib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -60,6 +61,9 @@ def _agent(recording: Recording) -> Agent:
     facts, path = recording.metadata, recording.path
     try:
         config = parse(tomllib.loads(facts["config"]), path.name)
+        flown, here = facts.get("foreign", "[]"), json.dumps([o._asdict() for o in config.foreign])
+        if json.loads(flown) != json.loads(here):
+            raise ValueError(f"it was flown with {flown}, and installed is {here}")
         vehicle_id, boot_id = int(facts["vehicle_id"]), int(facts["boot_id"])
         if boot_id not in BOOT_IDS:
             raise ValueError(f"boot id {boot_id}")

@@ -16,7 +16,7 @@ from companion.core.counts import Counts
 from companion.core.events import FailsafeNoted
 from companion.core.failsafe import LATE_S, Failsafe
 from companion.core.frames import Ned
-from companion.core.law.starling import Law, StarlingLaw
+from companion.core.law.base import Wanted
 from companion.core.neighbours.table import PeerTable
 from companion.core.safety.filter import SafetyFilter
 from companion.core.trajectory.fleet import Reference, TrajectoryState
@@ -36,6 +36,7 @@ from companion.errors import WireError
 from companion.vehicle import operator_port, plan_exchange
 from companion.vehicle.autopilot.port import AutopilotPort, Heard
 from companion.vehicle.autopilot.px4 import Px4Autopilot
+from companion.vehicle.guest import GUESTS, law_of, trigger_of
 from companion.vehicle.observer import StateObserver
 from companion.vehicle.operator_port import Activity, OperatorPort
 from companion.vehicle.orders import OrderBook
@@ -53,10 +54,12 @@ UNSTEERED_PREDICTION_NS = 200_000_000
 REJECTED = (
     "peer: unknown topic",
     "state: id is not the key's",
+    "state: of another law",
     *(f"state: {kind}" for kind in WIRE_FAULTS),
     *plan_exchange.REJECTED,
     *operator_port.REJECTED,
     *(failsafe.value for failsafe in Failsafe),
+    *GUESTS,
 )
 """what an agent counts"""
 
@@ -75,12 +78,13 @@ class Agent:
         self.autopilot: AutopilotPort = Px4Autopilot(config, self.vehicle)
         self.history = TrajectoryHistory([config.first_motion])
         self.peers = PeerTable(vehicle_id, others, config.peer_limits, self.history)
-        self.law: Law = StarlingLaw(config.gains)
+        self.law = law_of(config, self.rejected)
         """what is flown, before the filter; tests and studies may put another in its place"""
         self.safety = SafetyFilter(config.safety_limits)
         self.observer = StateObserver()
         self.supervisor = Supervisor(config, self.autopilot, self.history, self.peers, self._restart_filter)
-        self.publisher = Publisher(config, vehicle_id, boot_id, self.history, self.peers, random)
+        trigger = trigger_of(config, self.rejected)
+        self.publisher = Publisher(config, vehicle_id, boot_id, trigger, self.history, self.peers, random)
         self.plans = PlanExchange(
             config, vehicle_id, self.history, self.peers, self.supervisor, self.publisher, random, self.rejected
         )
@@ -151,6 +155,8 @@ class Agent:
         message = decode_state(payload)
         if sender != str(message.sample.vehicle_id):
             self.rejected["state: id is not the key's"] += 1
+        elif len(message.told) != len(self.law.fields):
+            self.rejected["state: of another law"] += 1
         elif self.peers.accept(message, now) is None:
             if self.id in message.near_ids:
                 self.publisher.near.named(now.monotonic_ns)
@@ -232,8 +238,9 @@ class Agent:
         neighbours = self._predict(ego, formation, now)
         residual, setpoint = ZERO, None
         if self.supervisor.steers:
-            command, residual = self._command(ego, reference, neighbours)
-            setpoint = self._constrain(command, ego, neighbours, dt_s)
+            wanted = self._command(ego, reference, neighbours)
+            residual = wanted.residual_ned_m
+            setpoint = self._constrain(wanted.command(reference), ego, neighbours, dt_s)
             self._steer(setpoint)
             self.publisher.see_near(self.safety.peer_planes, neighbours, reference.velocity_ned_m_s, now)
         self.supervisor.settle(ego, reference, now)
@@ -271,8 +278,8 @@ class Agent:
             )
         return self._neighbours
 
-    def _command(self, ego: VehicleState, reference: Reference, neighbours: Sequence[Neighbour]) -> tuple[Command, Ned]:
-        """What the law asks for, and the formation's mean residual about this vehicle (m)."""
+    def _command(self, ego: VehicleState, reference: Reference, neighbours: Sequence[Neighbour]) -> Wanted:
+        """What the law wants, and the formation's mean residual about this vehicle."""
         return self.law.command(ego, reference, neighbours, alone=self.supervisor.detached)
 
     def _constrain(
@@ -291,7 +298,7 @@ class Agent:
     def _publish(self, reference: Reference, residual: Ned, now: Instant) -> None:
         """Tell the peers, if the publisher finds that they must be told."""
         since_ns, outdated = self.supervisor.formation_since_ns, self.supervisor.outdated
-        own = OwnState(self.phase, *self.observer.smoothed, reference, residual, since_ns, outdated)
+        own = OwnState(self.phase, *self.observer.smoothed, reference, residual, since_ns, self.law.tell(), outdated)
         message = self.publisher.publish(own, now)
         if message is not None:
             self._outputs.peers.append(("state", message))
@@ -322,5 +329,6 @@ class Agent:
         )
 
     def _restart_filter(self) -> None:
-        """Whatever filter flies starts anew, as the vehicle does: it is the agent's, and nobody else holds it."""
+        """Whatever filter and law fly start anew, as the vehicle does: they are the agent's, nobody else holds them."""
         self.safety.reset()
+        self.law.reset()

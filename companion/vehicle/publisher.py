@@ -12,13 +12,13 @@ from typing import NamedTuple
 
 from companion.config import FleetConfig
 from companion.core.frames import Ned
-from companion.core.near import PUSH_M_S2, NearMode, near_push_m_s2
 from companion.core.neighbours.sample import predict_sample
 from companion.core.neighbours.table import PeerTable
 from companion.core.safety.filter import HalfPlane, push_m_s2
 from companion.core.trajectory.fleet import Reference
 from companion.core.trajectory.history import TrajectoryHistory
-from companion.core.trigger import Situation
+from companion.core.trigger.base import Situation, Trigger
+from companion.core.trigger.near import PUSH_M_S2, NearMode, near_push_m_s2
 from companion.core.values import (
     AIRBORNE_PHASES,
     FORMATION_PHASES,
@@ -68,6 +68,8 @@ class OwnState(NamedTuple):
     """of the formation about this vehicle"""
     formation_since_ns: int | None
     """fleet time from which the vehicle flies in formation"""
+    told: tuple[float, ...] = ()
+    """what the own law adds to messages (`core.law.base.Law.tell`)"""
     outdated: bool = False
     """a peer holds a newer trajectory"""
 
@@ -76,10 +78,10 @@ class Publisher:
     """One vehicle's state messages."""
 
     def __init__(
-        self, config: FleetConfig, vehicle_id: int, boot_id: int, history: TrajectoryHistory, peers: PeerTable,
-        random: Random,
+        self, config: FleetConfig, vehicle_id: int, boot_id: int, trigger: Trigger, history: TrajectoryHistory,
+        peers: PeerTable, random: Random,
     ) -> None:  # fmt: skip
-        self.trigger = config.trigger_rule
+        self.trigger = trigger
         self.near = NearMode(config.near_rate)
         self.messages_sent = 0
         self.sent_because: Counter[str] = Counter(dict.fromkeys(CAUSES, 0))
@@ -99,6 +101,8 @@ class Publisher:
         self._sent: tuple[PeerSample, tuple[Ned, Ned]] | None = None
         """last sample sent, with p_ref and v_d of the own slot at its time"""
         self._sent_ns = 0
+        self._told: tuple[float, ...] = ()
+        """what the law added to it"""
         self._silence_limit_s = 0.0
         self._announce_ns: list[int] = []
         """when what is announced is to be said, ascending"""
@@ -187,7 +191,7 @@ class Publisher:
             self._id, now.fleet_ns, own.position_ned_m, own.velocity_ned_m_s, newest.revision, own.phase
         )
         self._sent = (sample, self._reference_then(sample))
-        self._sent_ns = now.monotonic_ns
+        self._sent_ns, self._told = now.monotonic_ns, own.told
         self._silence_limit_s = self._spacing.t_max_s * (
             1.0 - HEARTBEAT_JITTER + HEARTBEAT_JITTER * self._random.random()
         )
@@ -199,7 +203,7 @@ class Publisher:
         return encode_state(
             PeerMessage(
                 self._boot_id, self._sequence, newest.start_ns, newest.issuer, sample, self._peers.digest(),
-                near_ids=near_ids, due_soon=near,
+                near_ids=near_ids, due_soon=near, told=own.told,
             )
         )  # fmt: skip
 
@@ -234,6 +238,8 @@ class Publisher:
             0.0 if since_ns is None else (now.fleet_ns - since_ns) * 1e-9,
             now.monotonic_ns + self._clock_shift_ns,
             self._sent_ns + self._clock_shift_ns,
+            self._told,
+            own.told,
         )
 
     def _reference_then(self, sample: PeerSample) -> tuple[Ned, Ned]:

@@ -1,8 +1,13 @@
-"""The core's own scalar functions, compiled, and the loops around them. Imported only once numba is wanted.
+"""The core's own functions, compiled, and the loops around them. Imported only once numba is wanted.
 
-Every formula of the law, the hold, the triggers, the gates and the barrier comes from `companion.core`; this file holds
+Law, safety filter, prediction, triggers and gates are those of `companion.core`, compiled as they are; this file holds
 the loops, the network, the noise and the double integrators. Arrays say their shape in `State`; N agents, R rows (a row
 is what one receiver holds of one sender: R = N while nothing is lost or late, else one for each ordered pair).
+
+What flies besides in a vehicle, and is left out here: the fence, the limits on jerk and speed, the altitude with its
+own loop and limits (the law acts in all three dimensions here), the bias observer, near mode, what a peer does on the
+ground or under its pilot, the growth of a lost peer's uncertainty. Sums over neighbours are rounded after each term,
+once in a vehicle: commands differ by less than 1e-9 of what is summed.
 """
 
 # ruff: noqa: PLR1714 - chained comparisons compile to simpler code than membership tests
@@ -18,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import config as numba_config
 
-from companion.core import estimate, trigger, vectors
+from companion.core import estimate, values, vectors
 from companion.core import prediction as hold
 from companion.core.frames import Ned
 from companion.core.law import consensus, intent
@@ -29,7 +34,11 @@ from companion.core.neighbours import gates
 from companion.core.prediction import Weights
 from companion.core.safety import filter as safety
 from companion.core.safety import program
-from companion.core.trigger import ErrorTrigger, SwitchingTrigger
+from companion.core.trajectory.fleet import Reference
+from companion.core.trigger import error, periodic, switching
+from companion.core.trigger.error import ErrorTrigger
+from companion.core.trigger.switching import SwitchingTrigger
+from companion.core.values import Neighbour, VehicleState
 from sim.swarm import baselines
 from sim.swarm.baselines import CUT
 
@@ -38,7 +47,10 @@ Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.uint8]
 F = TypeVar("F", bound=Callable[..., Any])
 
-_MODULES = (baselines, consensus, estimate, hold, gates, intent, law, program, safety, trigger, vectors)
+_MODULES = (
+    baselines, consensus, error, estimate, gates, hold, intent, law, periodic, program, safety, switching, values,
+    vectors,
+)  # fmt: skip
 
 
 def source_hash() -> str:
@@ -69,26 +81,43 @@ def kernel(function: F) -> F:
     return cast(F, numba.njit(cache=True, fastmath=FAST, error_model="numpy")(function))
 
 
+def inlined(function: F) -> F:
+    """A part of a kernel that is called for each agent: a call would hand over, and count, every array of the state."""
+    return cast(F, numba.njit(fastmath=FAST, error_model="numpy", inline="always")(function))
+
+
 _share = compiled(law._share)
 within_budget = compiled(law.within_budget, _share=_share)
 pair = compiled(law.pair)
 separation = compiled(law.separation, pair=pair)
-finish = compiled(law.finish, within_budget=within_budget)
+share = compiled(law.share, pair=pair, separation=separation)
+combine = compiled(law.combine, within_budget=within_budget)
+mean_residual = compiled(law.mean_residual)
 damped = compiled(hold.damped)
 zero = compiled(hold.zero)
 first = compiled(hold.first)
 axis = compiled(hold.axis)
-exceeds = compiled(trigger.exceeds)
-switching_threshold = compiled(trigger.switching_threshold)
-switching_exceeds = compiled(trigger.switching_exceeds, switching_threshold=switching_threshold)
+exceeds = compiled(error.exceeds)
+switching_threshold = compiled(switching.switching_threshold)
+switching_exceeds = compiled(switching.switching_exceeds, switching_threshold=switching_threshold)
+period_ended = compiled(periodic.period_ended)
 alpha_beta = compiled(estimate.alpha_beta)
+closest_point_parameter = compiled(vectors.closest_point_parameter)
+lerp = compiled(vectors.lerp)
+safety_radius_m = compiled(safety.safety_radius_m)
 barrier = compiled(safety.barrier)
+nearest_hypothesis = compiled(safety.nearest_hypothesis, closest_point_parameter=closest_point_parameter, lerp=lerp)
+_across_segment = compiled(safety._across_segment, closest_point_parameter=closest_point_parameter)
+half_plane = compiled(
+    safety.half_plane, nearest_hypothesis=nearest_hypothesis, _across_segment=_across_segment,
+    safety_radius_m=safety_radius_m, barrier=barrier,
+)  # fmt: skip
+out_of_reach = compiled(safety.out_of_reach, safety_radius_m=safety_radius_m)
 on_edge = compiled(program.on_edge)
 best = compiled(program.best, on_edge=on_edge)
 give_way = compiled(program.give_way, best=best)
 solve = compiled(program.solve, best=best, give_way=give_way)
 sidestep = compiled(safety.sidestep)
-closest_point_parameter = compiled(vectors.closest_point_parameter)
 avoid: Callable[[float, float, float, float, Floats, int, int, float, Floats], safety.Avoidance] = compiled(
     cast(Any, safety.avoid), sidestep=sidestep, solve=solve
 )
@@ -118,6 +147,7 @@ class Options(NamedTuple):
     """What a run is, as plain numbers (metres, seconds, m/s, m/s^2)."""
 
     dt: float
+    dt_ns: int
     every: int
     """steps per control period"""
     hold: int
@@ -126,6 +156,7 @@ class Options(NamedTuple):
     t_min: float
     t_max: float
     period: float
+    period_ns: int
     mode_by_residual: int
     """1: E_i of Eq. (5) is read as the mean formation residual instead of the estimation error"""
     count_start: int
@@ -149,7 +180,8 @@ class Options(NamedTuple):
     digest: int
     gates_after: float
     barrier: int
-    barrier_radius: float
+    uncertainty: float
+    """of every prediction (m): the safety radius less what the filter adds itself"""
     avoidance_max: float
     sigma_p: float
     sigma_p_time: float
@@ -246,6 +278,10 @@ class State(NamedTuple):
     """(R,) 1: the link is down"""
     keys: npt.NDArray[np.uint64]
     """(N, 8): each agent's own streams"""
+    near: Floats
+    """(most neighbours, ROW): what one agent knows of its neighbours"""
+    near_row: Ints
+    """(most neighbours,): which row of `predicted` each of these is"""
     planes: Floats
     """(most neighbours, 5): half-planes of the safety filter, with the velocity of each obstacle"""
     spare: Floats
@@ -339,6 +375,15 @@ def predict(
 
 
 @kernel
+def place_slots(k: int, s: State, ref: Floats) -> None:
+    """Where every slot is at step k."""
+    for i in range(s.x.shape[0]):
+        m = i if ref.shape[1] > 1 else 0
+        for c in range(3):
+            s.slot[i, c] = ref[k, m, c] + s.offset[i, c]
+
+
+@kernel
 def measure(k: int, s: State, o: Options) -> None:
     """Own states as the sensors give them at step k."""
     for i in range(s.x.shape[0]):
@@ -368,7 +413,7 @@ def filter_own(k: int, s: State, o: Options) -> None:
                 )
 
 
-@kernel
+@inlined
 def compose(i: int, k: int, s: State, ref: Floats, o: Options) -> None:
     """The sample that agent i would send now, into s.sent."""
     m = i if ref.shape[1] > 1 else 0
@@ -387,7 +432,7 @@ def compose(i: int, k: int, s: State, ref: Floats, o: Options) -> None:
     s.sent_step[i] = k
 
 
-@kernel
+@inlined
 def fires(i: int, k: int, s: State, o: Options, et: ErrorTrigger, st: SwitchingTrigger, it: IntentTrigger) -> bool:
     """Whether agent i's trigger asks for a message at step k; heartbeat and t_min come on top."""
     t = k * o.dt
@@ -415,8 +460,7 @@ def fires(i: int, k: int, s: State, o: Options, et: ErrorTrigger, st: SwitchingT
         s.counts[2 if math.sqrt(ep) + math.sqrt(ev) > st.eta else 3] += 1
         return switching_exceeds(ep, ev, t, st)
     if kind == PERIODIC:
-        steps = max(round(o.period / o.dt), 1)
-        return k % steps == 0
+        return period_ended(k * o.dt_ns, s.sent_step[i] * o.dt_ns, o.period_ns)
     if kind == FLOAT_CLOCK:
         if t - s.clock[i] >= o.period:
             s.clock[i] = t
@@ -474,7 +518,7 @@ def send(
             _digest(i, at, k, s, o)
 
 
-@kernel
+@inlined
 def _digest(i: int, at: int, k: int, s: State, o: Options) -> None:
     """The newest samples that agent i holds of others, newest first."""
     bound = k + 1
@@ -609,140 +653,223 @@ def _gates(i: int, s: State, o: Options) -> tuple[float, float]:
     return float(np.median(s.scratch[0, :count])), float(np.median(s.scratch[1, :count]))
 
 
+ROW = 22
+"""floats of a `Neighbour`: p^ 3, v^ 3, d_ij 3, in formation, shares the avoidance, uncertainty, lost, last seen 3,
+slot's velocity 3 and acceleration 3"""
+
+
+@kernel
+def neighbour(rows: Floats, k: int) -> Neighbour:
+    """Row k as the core's functions take it."""
+    last_seen = None
+    if rows[k, 12] > 0.0:
+        last_seen = Ned(rows[k, 13], rows[k, 14], rows[k, 15])
+    return Neighbour(
+        0, Ned(rows[k, 0], rows[k, 1], rows[k, 2]), Ned(rows[k, 3], rows[k, 4], rows[k, 5]),
+        Ned(rows[k, 6], rows[k, 7], rows[k, 8]), 0.0, rows[k, 9] > 0.0, rows[k, 10] > 0.0, rows[k, 11], last_seen,
+        Ned(rows[k, 16], rows[k, 17], rows[k, 18]), Ned(rows[k, 19], rows[k, 20], rows[k, 21]), (),
+    )  # fmt: skip
+
+
+@kernel
+def sums_over(ego: VehicleState, slot_velocity: Ned, rows: Floats, count: int, alone: bool, g: Gains) -> Sums:
+    """`law.sums_over` of the first `count` rows, rounded after each term."""
+    sx, sy, sz, vx, vy, vz, px, py, pz, rx, ry, rz, n = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(count):
+        q = share(ego, slot_velocity, neighbour(rows, k), alone, g)
+        sx, sy, sz = sx + q.sep_x, sy + q.sep_y, sz + q.sep_z
+        vx, vy, vz = vx + q.vel_x, vy + q.vel_y, vz + q.vel_z
+        px, py, pz = px + q.pos_x, py + q.pos_y, pz + q.pos_z
+        rx, ry, rz, n = rx + q.res_x, ry + q.res_y, rz + q.res_z, n + q.formed
+    return Sums(sx, sy, sz, vx, vy, vz, px, py, pz, rx, ry, rz, n)
+
+
+@kernel
+def constrain(
+    u_north: float, u_east: float, ego: VehicleState, shared: Ned, rows: Floats, count: int, most: float,
+    planes: Floats, spare: Floats,
+) -> safety.Avoidance:  # fmt: skip
+    """What `safety.SafetyFilter` makes of a command for the sake of the first `count` rows; see `safety.half_plane`."""
+    peers = 0
+    for k in range(count):
+        n = neighbour(rows, k)
+        if out_of_reach(ego, shared, n, most):
+            continue
+        h = half_plane(ego, shared, n)
+        planes[peers, 0], planes[peers, 1], planes[peers, 2] = h.g_north, h.g_east, h.b
+        planes[peers, 3], planes[peers, 4] = h.v_north, h.v_east
+        peers += 1
+    return avoid(
+        u_north, u_east, ego.velocity_ned_m_s.north, ego.velocity_ned_m_s.east, planes, peers, peers, most, spare
+    )
+
+
+@inlined
+def look(i: int, k: int, own: Floats, common: Ned, s: State, ref: Floats, o: Options) -> int:
+    """What agent i knows of its neighbours, into s.near; returns how many there are.
+
+    `common` is the velocity that leaderless agents take for that of everybody's slot.
+    """
+    t = k * o.dt
+    range2 = o.range_m * o.range_m
+    gated = t >= o.gates_after
+    mx, my = _gates(i, s, o) if gated else (0.0, 0.0)
+    several = ref.shape[1] > 1
+    near, predicted, column = s.near, s.predicted, s.column
+    x, y, z = own[0], own[1], own[2]
+    if o.range_on_truth == 1:
+        x, y, z = s.x[i, 0], s.x[i, 1], s.x[i, 2]
+    d0, d1, d2 = s.slot[i, 0], s.slot[i, 1], s.slot[i, 2]
+    count = 0
+    for e in range(s.start[i], s.start[i + 1]):
+        j = column[e]
+        r = e if o.links == 1 else j
+        m = j if several else 0
+        if o.links == 1 and s.held_step[e] == NEVER:
+            continue
+        # Every value is read before the first is written: the compiler cannot know that the arrays are apart.
+        p0, p1, p2 = predicted[r, 0], predicted[r, 1], predicted[r, 2]
+        ex, ey, ez = x - p0, y - p1, z - p2
+        if o.range_on_truth == 1:
+            ex, ey, ez = x - s.x[j, 0], y - s.x[j, 1], z - s.x[j, 2]
+        if ex * ex + ey * ey + ez * ez > range2:
+            continue
+        v0, v1, v2 = predicted[r, 3], predicted[r, 4], predicted[r, 5]
+        o0, o1, o2 = d0 - predicted[r, 6], d1 - predicted[r, 7], d2 - predicted[r, 8]
+        w0, w1, w2 = ref[k, m, 3], ref[k, m, 4], ref[k, m, 5]
+        a0, a1, a2 = ref[k, m, 6], ref[k, m, 7], ref[k, m, 8]
+        lost = j == o.fault_agent and t >= o.fault_step * o.dt + o.presence_delay
+        apart = lost
+        if gated:
+            q0, q1 = s.measured[i, 0], s.measured[i, 1]
+            apart = lost or is_outlier(v0 - w0, v1 - w1, q0 - p0 - o0 - mx, q1 - p1 - o1 - my)
+        if o.leaderless == 1:
+            w0, w1, w2 = common.north, common.east, common.down
+        near[count, 0], near[count, 1], near[count, 2] = p0, p1, p2
+        near[count, 3], near[count, 4], near[count, 5] = v0, v1, v2
+        near[count, 6], near[count, 7], near[count, 8] = o0, o1, o2
+        near[count, 9], near[count, 10] = 0.0 if apart else 1.0, 0.0 if lost else 1.0
+        near[count, 11], near[count, 12] = o.uncertainty, 1.0 if lost else 0.0
+        if lost:
+            near[count, 13], near[count, 14], near[count, 15] = s.stopped[r, 0], s.stopped[r, 1], s.stopped[r, 2]
+        near[count, 16], near[count, 17], near[count, 18] = w0, w1, w2
+        near[count, 19], near[count, 20], near[count, 21] = a0, a1, a2
+        s.near_row[count] = e
+        count += 1
+    return count
+
+
+@inlined
+def reread(i: int, count: int, own: Floats, s: State, o: Options, g: Gains) -> tuple[float, float, float]:
+    """What other readings of Eq. (2) add to the separation: distances between true positions, other forms of phi_s."""
+    sx, sy, sz = 0.0, 0.0, 0.0
+    for q in range(count):
+        row = s.near[q]
+        if row[12] > 0.0:
+            continue
+        dx, dy, dz = own[0] - row[0], own[1] - row[1], own[2] - row[2]
+        if o.separation_on_truth == 1:
+            j = s.column[s.near_row[q]]
+            f = separation(dx, dy, dz, g)
+            dx, dy, dz = s.x[i, 0] - s.x[j, 0], s.x[i, 1] - s.x[j, 1], s.x[i, 2] - s.x[j, 2]
+            h = separation(dx, dy, dz, g)
+            sx, sy, sz = sx + h.sep_x - f.sep_x, sy + h.sep_y - f.sep_y, sz + h.sep_z - f.sep_z
+        if o.separation_kind != CUT:
+            a = other_separation(o.separation_kind, dx, dy, dz, g)
+            sx, sy, sz = sx + a[0], sy + a[1], sz + a[2]
+    return sx, sy, sz
+
+
+@inlined
+def agree(i: int, count: int, dt: float, s: State, o: Options) -> None:
+    """One step of the estimate of the common velocity (`core.law.consensus`)."""
+    n, x, y, z = 0.0, 0.0, 0.0, 0.0
+    for q in range(count):
+        if s.near[q, 9] > 0.0:
+            e = s.near_row[q]
+            h = s.held[e] if o.links == 1 else s.sent[s.column[e]]
+            d0, d1, d2 = saturated(s.common[i, 0] - h[6], s.common[i, 1] - h[7], s.common[i, 2] - h[8], 1.0)
+            n, x, y, z = n + 1.0, x + d0, y + d1, z + d2
+    r0, r1, r2 = common_velocity_rate(n, x, y, z)
+    s.common[i, 0] += dt * r0
+    s.common[i, 1] += dt * r1
+    s.common[i, 2] += dt * r2
+
+
+@inlined
+def intended(
+    i: int, k: int, count: int, dt: float, ego: VehicleState, v_d: Ned, sums: Sums, s: State, ref: Floats, o: Options,
+    g: Gains, ig: IntentGains,
+) -> tuple[float, float, float]:  # fmt: skip
+    """The command of the published-intent law (`core.law.intent`), and one step of its anchor."""
+    m = i if ref.shape[1] > 1 else 0
+    n, ax, ay, az, qx, qy, qz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for q in range(count):
+        if s.near[q, 9] > 0.0:
+            e = s.near_row[q]
+            row = s.predicted[e if o.links == 1 else s.column[e]]
+            cx, cy, cz = s.anchor[i, 0] - row[9], s.anchor[i, 1] - row[10], s.anchor[i, 2] - row[11]
+            d0, d1, d2 = saturated(cx, cy, cz, 1.0)
+            n, ax, ay, az = n + 1.0, ax + d0, ay + d1, az + d2
+            qx, qy, qz = qx + cx, qy + cy, qz + cz
+    # residual of the anchors: what the trigger of this law looks at
+    each = max(n, 1.0)
+    s.residual[i, 0], s.residual[i, 1], s.residual[i, 2] = qx / each, qy / each, qz / each
+    g0, g1, g2 = anchor_rate(n, ax, ay, az, ig)
+    s.anchor_speed[i, 0], s.anchor_speed[i, 1], s.anchor_speed[i, 2] = g0, g1, g2
+    p, v = ego.position_ned_m, ego.velocity_ned_m_s
+    b0, b1, b2 = intent_rest(
+        p.north - s.slot[i, 0] - s.anchor[i, 0],
+        p.east - s.slot[i, 1] - s.anchor[i, 1],
+        p.down - s.slot[i, 2] - s.anchor[i, 2],
+        v.north - v_d.north - s.common[i, 0] - g0,
+        v.east - v_d.east - s.common[i, 1] - g1,
+        v.down - v_d.down - s.common[i, 2] - g2,
+        ref[k, m, 6], ref[k, m, 7], ref[k, m, 8], ig,
+    )  # fmt: skip
+    for c in range(3):
+        s.anchor[i, c] += dt * (s.common[i, c] + s.anchor_speed[i, c])
+    return within_budget(sums.sep_x, sums.sep_y, sums.sep_z, b0, b1, b2, g.a_max)
+
+
 @kernel
 def command(k: int, s: State, ref: Floats, o: Options, g: Gains, ig: IntentGains) -> None:
-    """Law, budget and barrier of every agent at step k, into s.u; and the estimates that go with them."""
-    n_agents = s.x.shape[0]
-    t = k * o.dt
+    """Law and safety filter of every agent at step k, into s.u; and the estimates that go with them."""
     dt = o.every * o.dt
-    range2 = o.range_m * o.range_m
-    for i in range(n_agents):
+    for i in range(s.x.shape[0]):
         m = i if ref.shape[1] > 1 else 0
-        n = 0.0
-        sums = Sums(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-        sx, sy, sz = 0.0, 0.0, 0.0
-        nx, ny, nz = 0.0, 0.0, 0.0
-        ax, ay, az = 0.0, 0.0, 0.0
-        qx, qy, qz = 0.0, 0.0, 0.0
         own = s.own[i] if o.own_held == 1 else s.measured[i]
-        gated = t >= o.gates_after
-        mx, my = _gates(i, s, o) if gated else (0.0, 0.0)
-        planes = 0
-        for e in range(s.start[i], s.start[i + 1]):
-            j = s.column[e]
-            r = e if o.links == 1 else j
-            mj = j if ref.shape[1] > 1 else 0
-            if o.links == 1 and s.held_step[e] == NEVER:
-                continue
-            row = s.predicted[r]
-            if o.range_on_truth == 1:
-                ex, ey, ez = s.x[i, 0] - s.x[j, 0], s.x[i, 1] - s.x[j, 1], s.x[i, 2] - s.x[j, 2]
-            else:
-                ex, ey, ez = own[0] - row[0], own[1] - row[1], own[2] - row[2]
-            if ex * ex + ey * ey + ez * ez > range2:
-                continue
-            lost = j == o.fault_agent and t >= o.fault_step * o.dt + o.presence_delay
-            px, py, pz = row[0], row[1], row[2]
-            vx, vy, vz = row[3], row[4], row[5]
-            if lost:
-                share = closest_point_parameter(
-                    Ned(s.measured[i, 0], s.measured[i, 1], s.measured[i, 2]), Ned(px, py, pz),
-                    Ned(s.stopped[r, 0], s.stopped[r, 1], s.stopped[r, 2]), safety.DOWNWASH_RATIO,
-                )  # fmt: skip
-                px += share * (s.stopped[r, 0] - px)
-                py += share * (s.stopped[r, 1] - py)
-                pz += share * (s.stopped[r, 2] - pz)
-                vx, vy, vz = (1.0 - share) * vx, (1.0 - share) * vy, (1.0 - share) * vz
-            dx, dy, dz = own[0] - px, own[1] - py, own[2] - pz
-            q = pair(
-                dx, dy, dz,
-                own[3] - vx - (ref[k, m, 3] - ref[k, mj, 3]),
-                own[4] - vy - (ref[k, m, 4] - ref[k, mj, 4]),
-                own[5] - vz - (ref[k, m, 5] - ref[k, mj, 5]),
-                s.slot[i, 0] - row[6], s.slot[i, 1] - row[7], s.slot[i, 2] - row[8], g,
-            )  # fmt: skip
-            outlier = gated and is_outlier(
-                vx - ref[k, mj, 3], vy - ref[k, mj, 4],
-                s.measured[i, 0] - px - s.slot[i, 0] + row[6] - mx, s.measured[i, 1] - py - s.slot[i, 1] + row[7] - my,
-            )  # fmt: skip
-            # separation counts for everybody
-            if o.separation_on_truth == 1:
-                dx, dy, dz = s.x[i, 0] - s.x[j, 0], s.x[i, 1] - s.x[j, 1], s.x[i, 2] - s.x[j, 2]
-                f = separation(dx, dy, dz, g)
-                sx, sy, sz = sx + f[0], sy + f[1], sz + f[2]
-            else:
-                sx, sy, sz = sx + q.sep_x, sy + q.sep_y, sz + q.sep_z
-            if o.separation_kind != CUT:
-                f = other_separation(o.separation_kind, dx, dy, dz, g)
-                sx, sy, sz = sx + f[0], sy + f[1], sz + f[2]
-            if not (lost or outlier):
-                n += 1.0
-                sums = Sums(
-                    0.0, 0.0, 0.0, sums.vel_x + q.vel_x, sums.vel_y + q.vel_y, sums.vel_z + q.vel_z,
-                    sums.pos_x + q.pos_x, sums.pos_y + q.pos_y, sums.pos_z + q.pos_z,
-                    sums.res_x + q.res_x, sums.res_y + q.res_y, sums.res_z + q.res_z,
-                )  # fmt: skip
-                if o.leaderless == 1:
-                    h = s.held[e] if o.links == 1 else s.sent[j]
-                    d0, d1, d2 = saturated(s.common[i, 0] - h[6], s.common[i, 1] - h[7], s.common[i, 2] - h[8], 1.0)
-                    nx, ny, nz = nx + d0, ny + d1, nz + d2
-                if o.intent == 1:
-                    cx, cy, cz = s.anchor[i, 0] - row[9], s.anchor[i, 1] - row[10], s.anchor[i, 2] - row[11]
-                    d0, d1, d2 = saturated(cx, cy, cz, 1.0)
-                    ax, ay, az = ax + d0, ay + d1, az + d2
-                    qx, qy, qz = qx + cx, qy + cy, qz + cz
-            if o.barrier == 1:
-                gn, ge, b = barrier(
-                    s.measured[i, 0] - px, s.measured[i, 1] - py, (s.measured[i, 2] - pz) / safety.DOWNWASH_RATIO,
-                    s.measured[i, 3] - vx, s.measured[i, 4] - vy, (s.measured[i, 5] - vz) / safety.DOWNWASH_RATIO,
-                    o.barrier_radius, not lost, ref[k, m, 6], ref[k, m, 7],
-                )  # fmt: skip
-                s.planes[planes, 0], s.planes[planes, 1], s.planes[planes, 2] = gn, ge, b
-                s.planes[planes, 3], s.planes[planes, 4] = vx, vy
-                planes += 1
+        ego = VehicleState(0, Ned(own[0], own[1], own[2]), Ned(own[3], own[4], own[5]))
+        v_d = Ned(ref[k, m, 3], ref[k, m, 4], ref[k, m, 5])
+        common = v_d
         if o.leaderless == 1:
-            d0, d1, d2 = common_velocity_rate(n, nx, ny, nz)
-            nx, ny, nz = d0, d1, d2
-        divisor = max(n, 1.0)
-        s.neighbours[i] = n
+            common = Ned(s.common[i, 0], s.common[i, 1], s.common[i, 2])
+        reference = Reference(
+            Ned(s.slot[i, 0], s.slot[i, 1], s.slot[i, 2]), common, Ned(ref[k, m, 6], ref[k, m, 7], ref[k, m, 8]), 0.0
+        )
+        count = look(i, k, own, common, s, ref, o)
+        sums = sums_over(ego, common, s.near, count, False, g)
+        if o.separation_on_truth == 1 or o.separation_kind != CUT:
+            x, y, z = reread(i, count, own, s, o, g)
+            sums = Sums(
+                sums.sep_x + x, sums.sep_y + y, sums.sep_z + z, sums.vel_x, sums.vel_y, sums.vel_z,
+                sums.pos_x, sums.pos_y, sums.pos_z, sums.res_x, sums.res_y, sums.res_z, sums.formed,
+            )  # fmt: skip
+        s.neighbours[i] = sums.formed
         if o.intent == 1:
-            # residual of the anchors: what the trigger of this law looks at
-            s.residual[i, 0], s.residual[i, 1], s.residual[i, 2] = qx / divisor, qy / divisor, qz / divisor
-            g0, g1, g2 = anchor_rate(n, ax, ay, az, ig)
-            s.anchor_speed[i, 0], s.anchor_speed[i, 1], s.anchor_speed[i, 2] = g0, g1, g2
-            b0, b1, b2 = intent_rest(
-                own[0] - s.slot[i, 0] - s.anchor[i, 0],
-                own[1] - s.slot[i, 1] - s.anchor[i, 1],
-                own[2] - s.slot[i, 2] - s.anchor[i, 2],
-                own[3] - ref[k, m, 3] - s.common[i, 0] - g0,
-                own[4] - ref[k, m, 4] - s.common[i, 1] - g1,
-                own[5] - ref[k, m, 5] - s.common[i, 2] - g2,
-                ref[k, m, 6], ref[k, m, 7], ref[k, m, 8], ig,
-            )  # fmt: skip
-            u0, u1, u2 = within_budget(sx, sy, sz, b0, b1, b2, g.a_max)
-            for c in range(3):
-                s.anchor[i, c] += dt * (s.common[i, c] + s.anchor_speed[i, c])
+            u0, u1, u2 = intended(i, k, count, dt, ego, v_d, sums, s, ref, o, g, ig)
         else:
-            s.residual[i, 0] = sums.res_x / divisor
-            s.residual[i, 1] = sums.res_y / divisor
-            s.residual[i, 2] = sums.res_z / divisor
-            w0, w1, w2 = ref[k, m, 3], ref[k, m, 4], ref[k, m, 5]
-            if o.leaderless == 1:
-                w0, w1, w2 = s.common[i, 0], s.common[i, 1], s.common[i, 2]
-            u0, u1, u2 = finish(
-                n,
-                Sums(sx, sy, sz, sums.vel_x, sums.vel_y, sums.vel_z, sums.pos_x, sums.pos_y, sums.pos_z,
-                     sums.res_x, sums.res_y, sums.res_z),
-                own[0] - s.slot[i, 0], own[1] - s.slot[i, 1], own[2] - s.slot[i, 2],
-                own[3] - w0, own[4] - w1, own[5] - w2,
-                ref[k, m, 6], ref[k, m, 7], ref[k, m, 8], g,
-            )  # fmt: skip
+            u0, u1, u2 = combine(sums, ego, reference, g)
+            residual = mean_residual(sums)
+            s.residual[i, 0], s.residual[i, 1], s.residual[i, 2] = residual.north, residual.east, residual.down
         if o.leaderless == 1:
-            s.common[i, 0] += dt * nx
-            s.common[i, 1] += dt * ny
-            s.common[i, 2] += dt * nz
+            agree(i, count, dt, s, o)
         if o.barrier == 1:
-            kept = avoid(u0, u1, s.measured[i, 3], s.measured[i, 4], s.planes, planes, planes, o.avoidance_max, s.spare)
+            q = s.measured[i]
+            true = VehicleState(0, Ned(q[0], q[1], q[2]), Ned(q[3], q[4], q[5]))
+            kept = constrain(
+                u0, u1, true, reference.acceleration_ned_m_s2, s.near, count, o.avoidance_max, s.planes, s.spare
+            )
             u0, u1 = kept.north, kept.east
             s.counts[4] += 1 if kept.peer else 0
         s.u[i, 0], s.u[i, 1], s.u[i, 2] = u0, u1, u2
@@ -842,10 +969,7 @@ def advance(
                     s.record_u[k // keep_every, i, c] = s.u[i, c]
         if k % o.every == 0:
             tick = k // o.every
-            for i in range(n):
-                m = i if ref.shape[1] > 1 else 0
-                for c in range(3):
-                    s.slot[i, c] = ref[k, m, c] + s.offset[i, c]
+            place_slots(k, s, ref)
             measure(k, s, o)
             filter_own(k, s, o)
             send(k, tick, s, ref, o, et, st, it, ig)
@@ -856,102 +980,6 @@ def advance(
             if o.dense_measures == 1:
                 watch(s, o, et)
         move(k, s, o)
-
-
-@kernel
-def law_fast(
-    x: Floats, v: Floats, rows: Floats, slot: Floats, start: Ints, column: Ints, range2: float,
-    vd: Floats, g: Gains, u: Floats, residual: Floats,
-) -> None:  # fmt: skip
-    """The flown law alone for large swarms: shared predictions (rows p^, v^, slot), one common plan, select
-    instead of branch."""
-    for i in range(x.shape[0]):
-        n = 0.0
-        s0, s1, s2 = 0.0, 0.0, 0.0
-        a0, a1, a2 = 0.0, 0.0, 0.0
-        c0, c1, c2 = 0.0, 0.0, 0.0
-        r0, r1, r2 = 0.0, 0.0, 0.0
-        px, py, pz = x[i, 0], x[i, 1], x[i, 2]
-        vx, vy, vz = v[i, 0], v[i, 1], v[i, 2]
-        ox, oy, oz = slot[i, 0], slot[i, 1], slot[i, 2]
-        for e in range(start[i], start[i + 1]):
-            j = column[e]
-            dx, dy, dz = px - rows[j, 0], py - rows[j, 1], pz - rows[j, 2]
-            q = pair(
-                dx, dy, dz, vx - rows[j, 3], vy - rows[j, 4], vz - rows[j, 5],
-                ox - rows[j, 6], oy - rows[j, 7], oz - rows[j, 8], g,
-            )  # fmt: skip
-            w = 1.0 if dx * dx + dy * dy + dz * dz <= range2 else 0.0
-            n += w
-            s0, s1, s2 = s0 + w * q.sep_x, s1 + w * q.sep_y, s2 + w * q.sep_z
-            a0, a1, a2 = a0 + w * q.vel_x, a1 + w * q.vel_y, a2 + w * q.vel_z
-            c0, c1, c2 = c0 + w * q.pos_x, c1 + w * q.pos_y, c2 + w * q.pos_z
-            r0, r1, r2 = r0 + w * q.res_x, r1 + w * q.res_y, r2 + w * q.res_z
-        u[i, 0], u[i, 1], u[i, 2] = finish(
-            n, Sums(s0, s1, s2, a0, a1, a2, c0, c1, c2, r0, r1, r2),
-            px - ox, py - oy, pz - oz, vx - vd[3], vy - vd[4], vz - vd[5], vd[6], vd[7], vd[8], g,
-        )  # fmt: skip
-        d = max(n, 1.0)
-        residual[i, 0], residual[i, 1], residual[i, 2] = r0 / d, r1 / d, r2 / d
-
-
-@kernel
-def barrier_fast(
-    x: Floats, v: Floats, rows: Floats, start: Ints, column: Ints, near: float, radius: float, avoidance_max: float,
-    vd: Floats, planes: Floats, spare: Floats, u: Floats,
-) -> int:  # fmt: skip
-    """The safety filter for large swarms, over the neighbours within `near`; returns how many commands it changed."""
-    changed = 0
-    for i in range(x.shape[0]):
-        count = 0
-        for e in range(start[i], start[i + 1]):
-            j = column[e]
-            dx, dy, dz = x[i, 0] - rows[j, 0], x[i, 1] - rows[j, 1], x[i, 2] - rows[j, 2]
-            if dx * dx + dy * dy + dz * dz > near * near:
-                continue
-            gn, ge, b = barrier(
-                dx, dy, dz / safety.DOWNWASH_RATIO, v[i, 0] - rows[j, 3], v[i, 1] - rows[j, 4],
-                (v[i, 2] - rows[j, 5]) / safety.DOWNWASH_RATIO, radius, True, vd[6], vd[7],
-            )  # fmt: skip
-            planes[count, 0], planes[count, 1], planes[count, 2] = gn, ge, b
-            planes[count, 3], planes[count, 4] = rows[j, 3], rows[j, 4]
-            count += 1
-        kept = avoid(u[i, 0], u[i, 1], v[i, 0], v[i, 1], planes, count, count, avoidance_max, spare)
-        u[i, 0], u[i, 1] = kept.north, kept.east
-        changed += 1 if kept.peer else 0
-    return changed
-
-
-@kernel
-def hold_and_trigger_fast(
-    k: int, x: Floats, v: Floats, sent: Floats, sent_step: Ints, limit: Floats, residual: Floats, slot: Floats,
-    ref: Floats, rows: Floats, own: Floats, keys: npt.NDArray[np.uint64], o: Options, ig: IntentGains,
-    et: ErrorTrigger, offset: Floats,
-) -> int:  # fmt: skip
-    """Trigger, send and hold for large swarms: writes every agent's row; returns the messages sent."""
-    messages = 0
-    for i in range(x.shape[0]):
-        ep, ev = 0.0, 0.0
-        for c in range(3):
-            slot[i, c] = ref[k, 0, c] + offset[i, c]
-        if sent_step[i] != NEVER:
-            predict(own, sent[i], sent_step[i], k, i, ref, slot[i], o, ig)
-            for c in range(3):
-                ep += (x[i, c] - own[c]) ** 2
-                ev += (v[i, c] - own[3 + c]) ** 2
-        res = residual[i, 0] ** 2 + residual[i, 1] ** 2 + residual[i, 2] ** 2
-        silent = (k - sent_step[i]) * o.dt
-        due = exceeds(ep, ev, res, et) and silent >= o.t_min
-        if sent_step[i] == NEVER or due or silent >= limit[i]:
-            messages += 1
-            sent_step[i] = k
-            limit[i] = o.t_max * (0.8 + 0.2 * uniform(keys[i, 3], k))
-            for c in range(3):
-                sent[i, c], sent[i, 3 + c] = x[i, c], v[i, c]
-                own[c], own[3 + c] = x[i, c], v[i, c]
-        for c in range(3):
-            rows[i, c], rows[i, 3 + c], rows[i, 6 + c] = own[c], own[3 + c], slot[i, c]
-    return messages
 
 
 @kernel

@@ -7,8 +7,8 @@ import pytest
 from flights import fleet, launch, until, wait
 
 from companion.config import FleetConfig
-from companion.core.near import NearMode
 from companion.core.safety.filter import COLLISION_DISTANCE_M
+from companion.core.trigger.near import NearMode
 from companion.core.values import Phase
 from companion.vehicle.publisher import CAUSES
 from sim.lockstep.lockstep import Lockstep

@@ -9,7 +9,10 @@ from hypothesis import strategies as st
 
 from companion.core.frames import Ned
 from companion.core.monitor import PeerMotion, unheard_error_m
-from companion.core.near import (
+from companion.core.prediction import axis, weights
+from companion.core.safety.filter import HalfPlane, half_plane, push_m_s2, resting_push_m_s2
+from companion.core.trigger.base import Situation
+from companion.core.trigger.near import (
     MISSING_MAX_M,
     PUSH_M_S2,
     NearMode,
@@ -18,9 +21,7 @@ from companion.core.near import (
     near_bound_m,
     near_push_m_s2,
 )
-from companion.core.prediction import axis, weights
-from companion.core.safety.filter import HalfPlane, half_plane, push_m_s2, resting_push_m_s2
-from companion.core.trigger import PeriodicTrigger, Situation
+from companion.core.trigger.periodic import PeriodicTrigger
 from companion.core.values import ZERO, Neighbour, VehicleState
 
 MOTION = PeerMotion(

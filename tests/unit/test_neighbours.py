@@ -11,7 +11,6 @@ from companion.core.failsafe import Failsafe
 from companion.core.formation import shape_slots
 from companion.core.frames import Ned
 from companion.core.monitor import PeerMotion, unheard_error_m
-from companion.core.near import MISSING_MAX_M, certain_age_s
 from companion.core.neighbours.gates import GATE_RESIDUAL_M, GATE_VELOCITY_M_S, is_outlier
 from companion.core.neighbours.sample import PeerLimits, predict_sample
 from companion.core.neighbours.table import (
@@ -28,6 +27,7 @@ from companion.core.trajectory.history import TrajectoryHistory
 from companion.core.trajectory.legs import TurnLeg, VelocityLeg
 from companion.core.trajectory.slots import SlotChange
 from companion.core.trajectory.successors import with_legs
+from companion.core.trigger.near import MISSING_MAX_M, certain_age_s
 from companion.core.values import Instant, Neighbour, PeerMessage, PeerSample, Phase
 
 PROPERTY = settings(deadline=None, max_examples=60)

@@ -47,7 +47,7 @@ class One:
         random = Random(seed)
         autopilot = Px4Autopilot(CONFIG, CONFIG.by_id(1))
         self.supervisor = Supervisor(CONFIG, autopilot, self.history, self.peers, lambda: None)
-        self.publisher = Publisher(CONFIG, 1, 7, self.history, self.peers, random)
+        self.publisher = Publisher(CONFIG, 1, 7, CONFIG.trigger_rule, self.history, self.peers, random)
         self.rejected = Counts(REJECTED)
         self.exchange = PlanExchange(
             CONFIG, 1, self.history, self.peers, self.supervisor, self.publisher, random, self.rejected

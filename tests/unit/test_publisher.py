@@ -40,7 +40,7 @@ class One:
     def __init__(self, seed: int = 1) -> None:
         self.history = TrajectoryHistory([CONFIG.first_motion])
         peers = PeerTable(1, frozenset({2, 3}), CONFIG.peer_limits, self.history)
-        self.publisher = Publisher(CONFIG, 1, 7, self.history, peers, Random(seed))
+        self.publisher = Publisher(CONFIG, 1, 7, CONFIG.trigger_rule, self.history, peers, Random(seed))
         self.now_ns = 1_000_000_000
         self.sent: list[tuple[int, PeerMessage]] = []
 
@@ -52,7 +52,7 @@ class One:
         """One tick with the vehicle so far north of its slot."""
         reference = self.history.reference(1, self.now.fleet_ns)
         p = reference.position_ned_m
-        own = OwnState(phase, p._replace(north=p.north + off_m), ZERO, reference, ZERO, UTC_NS, outdated)
+        own = OwnState(phase, p._replace(north=p.north + off_m), ZERO, reference, ZERO, UTC_NS, (), outdated)
         payload = self.publisher.publish(own, self.now)
         message = None if payload is None else decode_state(payload)
         if message is not None:

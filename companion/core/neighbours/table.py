@@ -12,7 +12,6 @@ from companion.core.counts import Counts
 from companion.core.events import PeerDoubted
 from companion.core.failsafe import SUSPECT_S, Failsafe
 from companion.core.frames import Ned
-from companion.core.near import near_bound_m
 from companion.core.neighbours import examination, silence
 from companion.core.neighbours.gates import GATE_PERIOD_NS, outliers
 from companion.core.neighbours.lost import nearest_piece
@@ -20,6 +19,7 @@ from companion.core.neighbours.sample import Foresight, PeerLimits, aloft, predi
 from companion.core.neighbours.track import Peer, Track
 from companion.core.trajectory.fleet import Reference, TrajectoryState
 from companion.core.trajectory.history import TrajectoryHistory
+from companion.core.trigger.near import near_bound_m
 from companion.core.values import (
     FLYING_PHASES,
     FORMATION_PHASES,
@@ -91,7 +91,8 @@ class PeerTable:
         if reason is None:
             reason = self._hear(self._peers[sample.vehicle_id], sample, message.boot_id, now)
             if reason is None:
-                self._peers[sample.vehicle_id].due_soon = message.due_soon
+                peer = self._peers[sample.vehicle_id]
+                peer.due_soon, peer.told = message.due_soon, message.told
         if reason is not None:
             self.rejected[reason] += 1
             return reason
@@ -364,4 +365,5 @@ class PeerTable:
             other_end,
             reference.velocity_ned_m_s,
             reference.acceleration_ned_m_s2,
+            peer.told,
         )

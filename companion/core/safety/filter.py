@@ -136,14 +136,10 @@ def half_plane(ego: VehicleState, shared_acceleration: Ned, neighbour: Neighbour
         vx, vy, vz = _across_segment(q, neighbour, vx, vy, vz)
     d = safety_radius_m(neighbour.uncertainty_m)
     s, t = shared_acceleration, neighbour.reference_acceleration_ned_m_s2
-    return HalfPlane(
-        *barrier(
-            x, y, z, vx, vy, vz, d, neighbour.shares_avoidance, 0.5 * (s.north + t.north), 0.5 * (s.east + t.east)
-        ),
-        neighbour.vehicle_id,
-        v.north,
-        v.east,
+    g_north, g_east, b = barrier(
+        x, y, z, vx, vy, vz, d, neighbour.shares_avoidance, 0.5 * (s.north + t.north), 0.5 * (s.east + t.east)
     )
+    return HalfPlane(g_north, g_east, b, neighbour.vehicle_id, v.north, v.east)
 
 
 def _across_segment(position: Ned, neighbour: Neighbour, vx: float, vy: float, vz: float) -> tuple[float, float, float]:
