@@ -96,7 +96,7 @@ class Companion:
             self.link = open_link(self.agent.vehicle)
             stack.callback(self.link.close)
             if settings.record is not None:
-                self.recorder = self._open_recorder(settings.record, metadata)
+                self.recorder = self._open_recorder(settings.record, metadata, config)
                 stack.callback(self.recorder.close)
             if connect is None:
                 self.network = peer_transport(config, settings.vehicle_id, self._wake)
@@ -106,10 +106,10 @@ class Companion:
             self.network.open()
             self._resources = stack.pop_all()
 
-    def _open_recorder(self, path: Path, metadata: dict[str, str]) -> Recorder:
+    def _open_recorder(self, path: Path, metadata: dict[str, str], config: FleetConfig) -> Recorder:
         facts = {**metadata, "vehicle_id": str(self.agent.id), "boot_id": str(self.agent.boot_id)}
-        if self.agent.config.foreign:
-            facts["foreign"] = json.dumps([o._asdict() for o in self.agent.config.foreign])
+        if config.foreign:
+            facts["foreign"] = json.dumps([o._asdict() for o in config.foreign])
         try:
             return Recorder(path, facts)
         except OSError as error:

@@ -126,10 +126,11 @@ class _Launch:
         missing: dict[int, str] = {}
         while True:
             ids = [v.id for v in config.vehicles]
+            since_s = time.monotonic()
             self._start_companions(ids)
             with operator_link(config) as link:
                 watch = Watch(
-                    Operator(config, link), self.processes, ids, self.show, began_s, self._ready,
+                    Operator(config, link), self.processes, ids, self.show, began_s, since_s, self._ready,
                     allow_missing=self.options.allow_missing, tell=self.tell,
                 )  # fmt: skip
                 try:

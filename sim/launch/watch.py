@@ -13,7 +13,7 @@ from sim.launch.faults import ScheduledFault, order_fault
 from sim.launch.processes import FleetProcesses
 
 MISSING_AFTER_S = 12.0
-"""a vehicle that nobody has heard by then is named as missing: after 15 s with the start of everything"""
+"""a vehicle that nobody has heard so long after the start of its companion is missing: it is named within 15 s"""
 PARAMETERS_GRACE_S = 12.0
 """whoever runs the autopilots says by itself, and a little later, which parameter was not as set"""
 LANDING_TIMEOUT_S = 90.0
@@ -58,6 +58,8 @@ class Watch:
     show: Callable[[Progress], None]
     began: float
     """when the flight's processes were started"""
+    since: float = 0.0
+    """when the companions were started"""
     ready: Path | None = None
     """a file that is there once the autopilots have their parameters; None: nobody sets any here"""
     allow_missing: bool = False
@@ -69,8 +71,6 @@ class Watch:
     """when the take-off was last commanded (UTC)"""
     clock: Callable[[], float] = time.monotonic
     sleep: Callable[[float], None] = time.sleep
-    _since_s: float | None = None
-    """when the companions were there to be asked first"""
     _told_missing: dict[int, str] = field(default_factory=dict)
 
     def _look(self, doing: str) -> dict[int, Status | None]:
@@ -148,8 +148,7 @@ class Watch:
 
     def _name_missing(self, answers: Said) -> None:
         """Say once who has not come MISSING_AFTER_S after the start; MissingError if the fleet may fly without."""
-        self._since_s = self.clock() if self._since_s is None else self._since_s
-        if self.clock() - self._since_s < MISSING_AFTER_S:
+        if self.clock() - self.since < MISSING_AFTER_S:
             return
         missing = {i: why for i, s in answers.items() if (why := _absence(s)) is not None}
         if missing and self.allow_missing:

@@ -30,11 +30,12 @@ def test_who_does_not_come_is_named_within_fifteen_seconds(tmp_path: Path) -> No
     fleet = make_fleet(tmp_path, 3)
     out = tmp_path / "flights"
     arguments = ("up", "--fleet", str(fleet.file), "--out", str(out), "--autopilot", "external", "--json")
-    began_s = time.monotonic()
     with (
         started("sim", "stub", "--fleet", str(without_third(fleet)), folder=tmp_path, name="stub"),
         started("sim", *arguments, folder=tmp_path, name="up") as up,
     ):
+        assert eventually(lambda: list(out.glob("*/companion-3.log")) != [])
+        began_s = time.monotonic()
         line = "vehicle 3 has not come: its autopilot is not heard (--allow-missing flies without)\n"
         assert eventually(lambda: up.err.count(line) == 1, 15.0 - (time.monotonic() - began_s)), up.err
         up.signal(signal.SIGINT)
