@@ -3,6 +3,7 @@
 In a checkout they stand where they are edited; an installed wheel has them among its data files.
 """
 
+import sys
 from pathlib import Path
 
 from companion.errors import ConfigError
@@ -14,18 +15,11 @@ _FOLDERS = {FLEET_FILE: "", SERVICE_FILE: "deploy"}
 
 def shipped(name: str) -> Path:
     """Where a shipped file is; ConfigError if this installation lacks it."""
-    checkout = Path(__file__).resolve().parents[1] / _FOLDERS[name] / name
-    if checkout.exists():
-        return checkout
-    from importlib.metadata import PackageNotFoundError, files
-
-    try:
-        installed = [Path(str(f.locate())) for f in files("starling-fleet") or () if f.name == name]
-    except PackageNotFoundError:
-        installed = []
-    for path in installed:
+    packages = Path(__file__).resolve().parents[1]
+    installed = Path("share", "starling-fleet", name)
+    for path in (packages / _FOLDERS[name] / name, packages / installed, Path(sys.prefix) / installed):
         if path.exists():
-            return path.resolve()
+            return path
     raise ConfigError(f"{name} did not come with this installation; install the package anew")
 
 

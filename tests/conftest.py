@@ -6,6 +6,7 @@ whose tests share a flight stays together: its flight is flown once.
 """
 
 import os
+from typing import Any
 
 import pytest
 
@@ -19,43 +20,45 @@ LANES = 2
 NICENESS = 10
 
 
+def lane(nodeid: str) -> str:
+    """What is run by one worker, one test after another: tests of one lane, else each test by itself."""
+    folder, name = nodeid.split("::", maxsplit=1)[0].split("/")[-2:]
+    if folder in ("process", "sitl"):
+        return "fleets" if folder == "sitl" or name in FLEETS else "processes"
+    if folder == "lockstep" and name in TOGETHER:
+        return name
+    return "compiled" if name in COMPILED else nodeid
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
     """One worker more than there are cores, since the lanes mostly wait."""
     return max((os.cpu_count() or 1) + 1, LANES)
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    from xdist.scheduler import LoadScopeScheduling
+
+    class Lanes(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            return lane(nodeid)
+
+    return Lanes(config, log)
+
+
 def pytest_configure(config: pytest.Config) -> None:
     worker = getattr(config, "workerinput", {}).get("workerid", "gw0")
     if int(worker.removeprefix("gw")) >= LANES:
         os.nice(NICENESS)
-    config.pluginmanager.register(Order())
 
 
-@pytest.hookimpl(tryfirst=True)
+@pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Say what stays together; xdist reads it when its own turn comes, before the order is settled."""
-    for item in items:
-        folder, name = item.path.parent.name, item.path.name
-        if folder in ("process", "sitl"):
-            item.add_marker(pytest.mark.xdist_group("fleets" if folder == "sitl" or name in FLEETS else "processes"))
-        elif folder == "lockstep" and name in TOGETHER:
-            item.add_marker(pytest.mark.xdist_group(name))
-        elif folder == "unit" and name in COMPILED:
-            item.add_marker(pytest.mark.xdist_group("compiled"))
+    # Lanes are dealt out in the order of the tests: what keeps real time first, next what is longest of the rest.
+    items.sort(key=lambda item: _turn(lane(item.nodeid), item.path.parent.name))
 
 
-class Order:
-    """Settles the order of the tests, after whoever shuffles them."""
-
-    @pytest.hookimpl(trylast=True)
-    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
-        # Groups are dealt out in the order of the tests: the lanes first, next what is longest of the rest.
-        items.sort(key=_turn)
-
-
-def _turn(item: pytest.Item) -> int:
-    folder, name = item.path.parent.name, item.path.name
-    if folder in ("process", "sitl"):
-        return 0 if name in FLEETS else 1
-    return 2 if name in COMPILED else 3 if folder == "lockstep" else 4
+def _turn(of: str, folder: str) -> int:
+    order = ("fleets", "processes", "compiled")
+    return order.index(of) if of in order else 3 if folder == "lockstep" else 4
