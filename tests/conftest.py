@@ -13,6 +13,8 @@ FLEETS = ("test_fleet_up.py",)
 """files of tests/process that fly whole fleets: half of the time of all"""
 TOGETHER = ("test_flight.py", "test_faults.py", "test_damaged_recordings.py")
 """files of tests/lockstep whose tests look at flights that they share"""
+COMPILED = ("test_swarm.py", "test_swarm_lockstep.py", "test_study.py")
+"""files of tests/unit that compile the swarm: once for all of them"""
 LANES = 2
 NICENESS = 10
 
@@ -27,21 +29,33 @@ def pytest_configure(config: pytest.Config) -> None:
     worker = getattr(config, "workerinput", {}).get("workerid", "gw0")
     if int(worker.removeprefix("gw")) >= LANES:
         os.nice(NICENESS)
+    config.pluginmanager.register(Order())
 
 
-@pytest.hookimpl(trylast=True)
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    first, then = [], []
+    """Say what stays together; xdist reads it when its own turn comes, before the order is settled."""
     for item in items:
         folder, name = item.path.parent.name, item.path.name
-        real_time = folder in ("process", "sitl")
-        if real_time:
-            lane = "fleets" if folder == "sitl" or name in FLEETS else "processes"
-            item.add_marker(pytest.mark.xdist_group(lane))
+        if folder in ("process", "sitl"):
+            item.add_marker(pytest.mark.xdist_group("fleets" if folder == "sitl" or name in FLEETS else "processes"))
         elif folder == "lockstep" and name in TOGETHER:
             item.add_marker(pytest.mark.xdist_group(name))
-        (first if real_time else then).append(item)
-    # Groups are dealt out in the order of the tests: the lanes first, next what is longest of the rest.
-    first.sort(key=lambda item: item.path.name in FLEETS, reverse=True)
-    then.sort(key=lambda item: item.path.parent.name != "lockstep")
-    items[:] = first + then
+        elif folder == "unit" and name in COMPILED:
+            item.add_marker(pytest.mark.xdist_group("compiled"))
+
+
+class Order:
+    """Settles the order of the tests, after whoever shuffles them."""
+
+    @pytest.hookimpl(trylast=True)
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        # Groups are dealt out in the order of the tests: the lanes first, next what is longest of the rest.
+        items.sort(key=_turn)
+
+
+def _turn(item: pytest.Item) -> int:
+    folder, name = item.path.parent.name, item.path.name
+    if folder in ("process", "sitl"):
+        return 0 if name in FLEETS else 1
+    return 2 if name in COMPILED else 3 if folder == "lockstep" else 4

@@ -1,21 +1,22 @@
 """Faults of a fleet.toml that only several values together show, each as a sentence."""
 
 from collections.abc import Iterator
-from math import sqrt
+from math import inf, sqrt
 
 from companion.config.derived import FleetConfig
 from companion.config.endpoints import companion_port, is_zenoh_endpoint, serial_endpoint, udp_endpoint
 from companion.config.schema import FenceTable, GotoLegTable, TurnLegTable, VelocityLegTable
 from companion.core.formation import minimum_distance
+from companion.core.law.base import FIELDS_MAX
 from companion.core.safety.fence import Fence
-from companion.core.trajectory import with_legs
+from companion.core.trajectory.successors import with_legs
 from companion.core.trajectory_check import PLAN_SPEED_SHARE, TURN_RATE_MIN_DEG_S, Fault, examine
 from companion.errors import ConfigError
 
 
 def faults(config: FleetConfig) -> list[str]:
     """All that is wrong with a file whose values are each in range; what follows from another fault is left out."""
-    found = list(_table_faults(config))
+    found = list(_rule_faults(config)) or list(_table_faults(config))
     if found:
         return found
     try:
@@ -23,6 +24,27 @@ def faults(config: FleetConfig) -> list[str]:
     except ConfigError as error:
         return [str(error)]
     return list(_motion_faults(config))
+
+
+def _rule_faults(config: FleetConfig) -> Iterator[str]:
+    """A law or a trigger that cannot be made from its table, or does not say what all others reckon with.
+
+    Ours can; what those of other packages do is anything.
+    """
+    try:
+        fields = config.law.law(config.r0_m).fields
+        if not (isinstance(fields, tuple) and len(fields) <= FIELDS_MAX and all(isinstance(f, str) for f in fields)):
+            yield f"$.law.kind = {config.law.kind!r}: its fields must be at most {FIELDS_MAX} names, got {fields!r}"
+    except Exception as error:  # noqa: BLE001 - see above
+        yield f"$.law.kind = {config.law.kind!r} cannot be made: {type(error).__name__}: {error}"
+    try:
+        bound_m = config.prediction_error_m
+        if not 0.0 < bound_m < inf:
+            yield f"$.trigger.kind = {config.trigger.kind!r}: its error bound must be finite and > 0 m, got {bound_m}"
+        elif not isinstance(config.trigger_rule.cause, str):
+            yield f"$.trigger.kind = {config.trigger.kind!r}: its cause must be a sentence's part"
+    except Exception as error:  # noqa: BLE001 - see above
+        yield f"$.trigger.kind = {config.trigger.kind!r} cannot be made: {type(error).__name__}: {error}"
 
 
 def _table_faults(config: FleetConfig) -> Iterator[str]:
@@ -60,16 +82,7 @@ def _table_faults(config: FleetConfig) -> Iterator[str]:
             f"$.launch.spacing_m / $.vehicle[].pad_m: pads must be at least the safety radius "
             f"{config.safety_radius_m:.2f} m apart ({config.radius_reason}), got {minimum_distance(pads):.2f} m"
         )
-    t = config.trigger
-    if t.t_min_s > t.near_period_s:
-        yield f"$.trigger.t_min_s must be <= $.trigger.near_period_s = {t.near_period_s:g} s, got {t.t_min_s:g}"
-    if t.kind == "periodic" and t.period_s < t.t_min_s:
-        yield f"$.trigger.period_s must be >= $.trigger.t_min_s = {t.t_min_s:g} s, got {t.period_s:g}"
-    if config.trigger.t_min_s >= config.trigger.t_max_s:
-        yield (
-            f"$.trigger.t_min_s must be below $.trigger.t_max_s = {config.trigger.t_max_s:g} s, "
-            f"got {config.trigger.t_min_s:g}"
-        )
+    yield from config.trigger.faults()
     if config.peers.range_m < config.range_min_m:
         yield (
             f"$.peers.range_m must be at least {config.range_min_m:.2f} m ($.formation.spacing_m, and twice the way of "

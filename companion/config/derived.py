@@ -8,31 +8,26 @@ from math import ceil, inf, radians, sqrt
 from typing import Literal
 
 from companion.config.endpoints import companion_port
+from companion.config.law_tables import LAWS
 from companion.config.numbers import Table
+from companion.config.registry import Origin
 from companion.config.schema import FleetTables, GotoLegTable, HoldLegTable, LegTable, TurnLegTable, VelocityLegTable
+from companion.config.trigger_tables import TRIGGERS
 from companion.core import assignment
 from companion.core.formation import SHAPES, Slots, centred, minimum_distance, rotated, shape_slots
 from companion.core.frames import Geodetic, Ned
-from companion.core.law.starling import Gains, paper_gains
 from companion.core.monitor import PeerMotion
-from companion.core.neighbours import PeerLimits
+from companion.core.neighbours.sample import PeerLimits
 from companion.core.safety.fence import Fence
 from companion.core.safety.filter import DOWNWASH_RATIO, SafetyLimits, safety_radius_m
-from companion.core.trajectory import (
-    PADS,
-    FleetTrajectory,
-    Leg,
-    SlotChange,
-    TurnLeg,
-    VelocityLeg,
-    goto_leg,
-    leg_end,
-    top_speed_m_s,
-    with_formation,
-    with_return,
-)
+from companion.core.trajectory.fleet import PADS, FleetTrajectory, top_speed_m_s
+from companion.core.trajectory.goto import goto_leg
+from companion.core.trajectory.legs import Leg, TurnLeg, VelocityLeg, leg_end
+from companion.core.trajectory.slots import SlotChange
+from companion.core.trajectory.successors import with_formation, with_return
 from companion.core.trajectory_check import ALTITUDE_MIN_M, PLAN_SPEED_SHARE, MotionLimits
-from companion.core.trigger import ErrorTrigger, PeriodicTrigger, Spacing, SwitchingTrigger, Trigger
+from companion.core.trigger.base import Spacing, Trigger
+from companion.core.trigger.periodic import PeriodicTrigger
 from companion.core.values import ZERO
 from companion.errors import ConfigError
 
@@ -112,25 +107,16 @@ class FleetConfig(FleetTables):
         """Range of separation."""
         return self.formation.spacing_m / 2 if self.law.r0_m is None else self.law.r0_m
 
-    @property
-    def gains(self) -> Gains:
-        """The law's gains: ours, or Eq. (2) of the paper as it stands within the acceleration limit."""
-        law = self.law
-        if law.kind == "paper":
-            return paper_gains(law.k_s, law.k_a, law.k_c, self.r0_m)._replace(a_max=law.a_max_m_s2)
-        return Gains(law.k_s, law.k_a, law.k_c, law.k_v, law.k_p, self.r0_m, law.a_max_m_s2, 1.0, 1.0, 1.0)
-
     @cached_property
     def trigger_rule(self) -> Trigger:
-        """The trigger of the configured kind."""
-        t = self.trigger
-        match t.kind:
-            case "error":
-                return ErrorTrigger(t.epsilon_m, t.gamma_s2, t.kappa)
-            case "switching":
-                return SwitchingTrigger(t.gamma_s2, t.alpha, t.beta, t.delta_min, t.delta_f, t.eta)
-            case "periodic":
-                return PeriodicTrigger(t.period_s)
+        """The trigger that the bounds are computed from; each vehicle has its own."""
+        return self.trigger.trigger()
+
+    @property
+    def foreign(self) -> tuple[Origin, ...]:
+        """Where the kinds of law and trigger come from that are not ours."""
+        origins = (LAWS.origin(self.law.kind), TRIGGERS.origin(self.trigger.kind))
+        return tuple(o for o in origins if o is not None)
 
     @property
     def near_rate(self) -> PeriodicTrigger:
@@ -141,7 +127,7 @@ class FleetConfig(FleetTables):
     def message_spacing(self) -> Spacing:
         return Spacing(self.trigger.t_min_s, self.trigger.t_max_s)
 
-    @property
+    @cached_property
     def prediction_error_m(self) -> float:
         """Bound on how far a peer that is heard may be from its prediction (m)."""
         return self.trigger_rule.error_bound_m(self.peer_motion)
@@ -378,6 +364,9 @@ class FleetConfig(FleetTables):
 
     @cached_property
     def shared_hash(self) -> str:
-        """Digest of what the vehicles must agree on: everything but links and the stubs' noise."""
+        """Digest of what the vehicles must agree on: everything but links and the stubs' noise, the packages of
+        foreign kinds included."""
         shared = self.model_dump(exclude={"stub": True, "vehicle": {"__all__": {"mavlink", "zenoh"}}})
+        if self.foreign:
+            shared["foreign"] = self.foreign
         return blake2s(json.dumps(shared, sort_keys=True).encode(), digest_size=8).hexdigest()

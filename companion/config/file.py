@@ -40,7 +40,7 @@ def parse(tables: Mapping[str, Any], name: str) -> FleetConfig:
     try:
         config = FleetConfig.model_validate_json(json.dumps(tables, default=str))
     except ValidationError as error:
-        found = list(dict.fromkeys(sentence(e) for e in error.errors()))
+        found = list(dict.fromkeys(sentence(e, tables) for e in error.errors()))
         raise ConfigError("\n".join(f"{name}: {fault}" for fault in found)) from error
     found = faults(config)
     if found:

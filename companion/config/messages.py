@@ -7,7 +7,10 @@ import annotated_types
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
+from companion.config.law_tables import LAWS
+from companion.config.registry import Registry
 from companion.config.schema import FleetTables, GotoLegTable, HoldLegTable, TurnLegTable, VelocityLegTable
+from companion.config.trigger_tables import TRIGGERS
 
 _UNITS = {
     "_m_s3": "m/s^3", "_m_s2": "m/s^2", "_m_s": "m/s", "_deg_s": "deg/s", "_per_s": "1/s", "_s2": "s^2", "_deg": "deg",
@@ -15,8 +18,8 @@ _UNITS = {
 }  # fmt: skip
 
 
-def sentence(error: Any) -> str:
-    """One fault as a sentence: where, what is allowed, what came."""
+def sentence(error: Any, tables: Mapping[str, Any]) -> str:
+    """One fault of the raw tables as a sentence: where, what is allowed, what came."""
     loc = [p for k, p in enumerate(error["loc"]) if not (p in _LEGS and k >= 3 and error["loc"][0] == "plan")]
     if "slot" in loc:
         # The two kinds of value that a slot may have are two faults to the validator.
@@ -25,7 +28,9 @@ def sentence(error: Any) -> str:
     came = error["input"]
     match error["type"]:
         case "extra_forbidden":
-            return f"{path} is not a known key; known here: {', '.join(sorted(_place(error['loc'][:-1])[0]))}"
+            return f"{path} is not a known key; known here: {', '.join(sorted(_place(error['loc'][:-1], tables)[0]))}"
+        case "kind":
+            return f"{path}.kind must be one of {error['ctx']['known']}, got {error['ctx']['came']!r}"
         case "too_short":
             return f"{path} must have at least {error['ctx']['min_length']}, got {error['ctx']['actual_length']}"
         case "missing":
@@ -35,7 +40,7 @@ def sentence(error: Any) -> str:
         case "union_tag_invalid" | "union_tag_not_found":
             return f"{path}.kind must be one of hold, velocity, turn, goto, got {came!r}"
     unit = next((u for s, u in _UNITS.items() if str(loc[-1]).endswith(s)), "") if loc[-1] != "k_s" else ""
-    allowed = _allowed(tuple(loc) if "slot" in loc else error["loc"])
+    allowed = _allowed(tuple(loc) if "slot" in loc else error["loc"], tables)
     message = error["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
     rule = f"must be {allowed} {unit}".rstrip() if allowed else f"must be {message}"
     return f"{path} {rule}, got {came!r}"
@@ -46,7 +51,10 @@ _LEGS: Mapping[str, type[BaseModel]] = {
 }  # fmt: skip
 
 
-def _place(loc: Sequence[str | int]) -> tuple[Mapping[str, FieldInfo], FieldInfo | None]:
+_REGISTRIES: Mapping[str, Registry[Any]] = {"law": LAWS, "trigger": TRIGGERS}
+
+
+def _place(loc: Sequence[str | int], tables: Mapping[str, Any]) -> tuple[Mapping[str, FieldInfo], FieldInfo | None]:
     """The fields of the table at a place of the file, and the field that the place itself is."""
     fields: Mapping[str, FieldInfo] = FleetTables.model_fields
     field: FieldInfo | None = None
@@ -57,6 +65,8 @@ def _place(loc: Sequence[str | int]) -> tuple[Mapping[str, FieldInfo], FieldInfo
             field = fields[part]
             table = _inner(field.annotation)
             fields = {} if table is None else table.model_fields
+            if part in _REGISTRIES:
+                fields = _REGISTRIES[part].fields(tables[part])
         elif part in _LEGS:
             fields = _LEGS[part].model_fields
         else:
@@ -86,9 +96,9 @@ def _scalars(annotation: Any) -> Iterator[Any]:
             yield from _scalars(argument)
 
 
-def _allowed(loc: Sequence[str | int]) -> str:
+def _allowed(loc: Sequence[str | int], tables: Mapping[str, Any]) -> str:
     """The range of a numeric field, as 'a finite number > 0'."""
-    _, field = _place(loc)
+    _, field = _place(loc, tables)
     if field is None:
         return ""
     scalars = list(_scalars(field.annotation))

@@ -4,9 +4,10 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from companion.config.law_tables import LawTable, TriggerTable
+from companion.config.law_tables import AnyLaw, StarlingTable
 from companion.config.numbers import Noise, NotNegative, Percent, Positive, Real, Table, VehicleId, Wait
-from companion.core.trajectory import Then
+from companion.config.trigger_tables import AnyTrigger, ErrorTable
+from companion.core.trajectory.fleet import Then
 from companion.core.trajectory_check import (
     DURATION_MAX_S,
     LEGS_MAX,
@@ -236,8 +237,8 @@ class FleetTables(Table):
     fleet: FleetTable
     formation: FormationTable = FormationTable()
     plan: PlanTable = PlanTable()
-    law: LawTable = LawTable()
-    trigger: TriggerTable = TriggerTable()
+    law: AnyLaw = StarlingTable()
+    trigger: AnyTrigger = ErrorTable()
     limits: LimitsTable = LimitsTable()
     fence: FenceTable | None = None
     peers: PeersTable = PeersTable()

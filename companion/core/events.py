@@ -5,7 +5,7 @@ from enum import Enum, unique
 
 from companion.core.failsafe import Action, Failsafe
 from companion.core.phase import PhaseEvent
-from companion.core.trajectory import FleetTrajectory
+from companion.core.trajectory.fleet import FleetTrajectory
 from companion.core.values import Phase
 
 

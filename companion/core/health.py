@@ -45,13 +45,14 @@ class PositionWatch:
         """Forget: the autopilot has booted anew, or its frame has."""
         self._time_ns, self._frozen = None, False
 
-    def see(self, time_ns: int, position_ned_m: Ned, velocity_ned_m_s: Ned) -> None:
-        """Take the next position, made at `time_ns` (monotonic)."""
+    def see(self, time_ns: int, position_ned_m: Ned, velocity_ned_m_s: Ned) -> bool:
+        """Take the next position, made at `time_ns` (monotonic); whether it jumped."""
+        jumps = False
         state = (position_ned_m, velocity_ned_m_s)
         if self._time_ns is not None:
             dt_s = max(time_ns - self._time_ns, 0) * 1e-9
-            if jumped(self._state, state, dt_s, ACCELERATION_M_S2, self.margin_m, self.margin_m_s):
-                self.jumps += 1
+            jumps = jumped(self._state, state, dt_s, ACCELERATION_M_S2, self.margin_m, self.margin_m_s)
+            self.jumps += jumps
             same = position_ned_m == self._state[0] and hypot(*velocity_ned_m_s) > MOVING_M_S
             if not same:
                 self._same_since_ns = time_ns
@@ -59,6 +60,7 @@ class PositionWatch:
         else:
             self._same_since_ns = time_ns
         self._time_ns, self._state = time_ns, state
+        return jumps
 
     @property
     def frozen(self) -> bool:

@@ -3,7 +3,9 @@
 from dataclasses import dataclass
 
 from companion.core.frames import Ned
-from companion.core.trajectory import Reference, SlotChange, blend_duration_s, fading, minimum_jerk
+from companion.core.trajectory.fleet import Reference
+from companion.core.trajectory.polynomials import fading, minimum_jerk
+from companion.core.trajectory.slots import SlotChange, blend_duration_s
 from companion.core.values import ZERO
 
 

@@ -15,20 +15,19 @@ from typing import NamedTuple
 
 from companion.core.frames import Ned
 from companion.core.safety.fence import Fence
-from companion.core.trajectory import (
-    MINIMUM_JERK_BEND,
+from companion.core.trajectory.fleet import FleetTrajectory, TrajectoryState
+from companion.core.trajectory.legs import (
     PLAN_ACCELERATION_M_S2,
     TURN_RAMP_S,
-    FleetTrajectory,
     GotoLeg,
-    SlotChange,
-    TrajectoryState,
     TurnLeg,
     VelocityLeg,
     leg_duration_s,
     turn_rate_and_time,
     velocity_ramp_s,
 )
+from companion.core.trajectory.polynomials import MINIMUM_JERK_BEND
+from companion.core.trajectory.slots import SlotChange
 from companion.core.values import ZERO
 
 RESOLUTION_M = 0.01

@@ -97,9 +97,11 @@ class PeerMessage:
     digest: tuple[PeerSample, ...]
     """the sender's latest samples of others, newest first"""
     near_ids: tuple[int, ...] = ()
-    """vehicles that the sender finds near (`core.near`), ascending"""
+    """vehicles that the sender finds near (`core.trigger.near`), ascending"""
     due_soon: bool = False
     """the sender speaks in near mode: its next message comes within `trigger.near_period_s` and a control period"""
+    told: tuple[float, ...] = ()
+    """what the sender's law adds (`core.law.base.Law.fields`)"""
 
 
 class Neighbour(NamedTuple):
@@ -123,6 +125,8 @@ class Neighbour(NamedTuple):
     reference_velocity_ned_m_s: Ned = ZERO
     """what the plan asks of its slot: differs from the own slot's while slots turn or move"""
     reference_acceleration_ned_m_s2: Ned = ZERO
+    told: tuple[float, ...] = ()
+    """what its law told last, by the peer's own message (`core.law.base.Law.fields`); empty before the first"""
 
 
 class Command(NamedTuple):

@@ -1,5 +1,6 @@
 """Replay: the agent on recorded inputs, its outputs compared with the recorded ones."""
 
+import json
 import tomllib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -11,7 +12,7 @@ from companion.core.values import Instant
 from companion.errors import CompanionError
 from companion.io.recorder import Entry, Gap, Recording, RecordingError, gap_between, read_recording
 from companion.vehicle.agent import Agent
-from companion.vehicle.border import Border
+from companion.vehicle.guard import Guard
 
 ANSWER = "output/answer"
 OUTPUTS = ("output/mavlink", "output/peer", ANSWER)
@@ -60,6 +61,9 @@ def _agent(recording: Recording) -> Agent:
     facts, path = recording.metadata, recording.path
     try:
         config = parse(tomllib.loads(facts["config"]), path.name)
+        flown, here = facts.get("foreign", "[]"), json.dumps([o._asdict() for o in config.foreign])
+        if json.loads(flown) != json.loads(here):
+            raise ValueError(f"it was flown with {flown}, and installed is {here}")
         vehicle_id, boot_id = int(facts["vehicle_id"]), int(facts["boot_id"])
         if boot_id not in BOOT_IDS:
             raise ValueError(f"boot id {boot_id}")
@@ -75,7 +79,7 @@ def replay(agent: Agent, entries: Iterable[Entry], complete: bool = True) -> Rep
 
     Of a recording that is not complete (its process was killed) the last outputs may be missing.
     """
-    border = Border(agent)
+    guard = Guard(agent)
     expected: list[tuple[str, bytes]] = []
     inputs = outputs = ticks = 0
     before: Entry | None = None
@@ -105,7 +109,7 @@ def replay(agent: Agent, entries: Iterable[Entry], complete: bool = True) -> Rep
             return ReplayResult(inputs, outputs, f"{_at(entry)}: replayed {channel} {body.hex()}, recorded nothing")
         inputs += 1
         try:
-            expected = list(INPUTS[entry.channel](border, entry.body, entry.instant))
+            expected = list(INPUTS[entry.channel](guard, entry.body, entry.instant))
         except Exception as error:  # noqa: BLE001 - an entry that is none: damaged, or of another version
             said = f"{type(error).__name__}: {error}"
             return ReplayResult(
@@ -122,41 +126,41 @@ def _at(entry: Entry) -> str:
     return f"monotonic {entry.instant.monotonic_ns * 1e-9:.6f} s"
 
 
-def _advance(border: Border, _: bytes, now: Instant) -> Iterator[tuple[str, bytes]]:
-    out = border.advance(now)
+def _advance(guard: Guard, _: bytes, now: Instant) -> Iterator[tuple[str, bytes]]:
+    out = guard.advance(now)
     for datagram in out.mavlink:
         yield "output/mavlink", datagram
     for topic, payload in out.peers:
         yield "output/peer", topic.encode() + b"\0" + payload
 
 
-def _mavlink(border: Border, body: bytes, now: Instant) -> Iterator[tuple[str, bytes]]:
-    border.receive_mavlink(body, now)
+def _mavlink(guard: Guard, body: bytes, now: Instant) -> Iterator[tuple[str, bytes]]:
+    guard.receive_mavlink(body, now)
     return iter(())
 
 
-def _peer(border: Border, body: bytes, now: Instant) -> Iterator[tuple[str, bytes]]:
+def _peer(guard: Guard, body: bytes, now: Instant) -> Iterator[tuple[str, bytes]]:
     key, _, payload = body.partition(b"\0")
-    border.receive_peer(key.decode(), payload, now)
+    guard.receive_peer(key.decode(), payload, now)
     return iter(())
 
 
-def _presence(border: Border, body: bytes, now: Instant) -> Iterator[tuple[str, bytes]]:
-    border.receive_presence(body[0], bool(body[1]), now)
+def _presence(guard: Guard, body: bytes, now: Instant) -> Iterator[tuple[str, bytes]]:
+    guard.receive_presence(body[0], bool(body[1]), now)
     return iter(())
 
 
-def _command(border: Border, body: bytes, now: Instant) -> Iterator[tuple[str, bytes]]:
-    yield ANSWER, border.receive_command(body, now)
+def _command(guard: Guard, body: bytes, now: Instant) -> Iterator[tuple[str, bytes]]:
+    yield ANSWER, guard.receive_command(body, now)
 
 
-def _stop(border: Border, _: bytes, now: Instant) -> Iterator[tuple[str, bytes]]:
-    border.stop(now)
+def _stop(guard: Guard, _: bytes, now: Instant) -> Iterator[tuple[str, bytes]]:
+    guard.stop(now)
     return iter(())
 
 
-def _notice(border: Border, body: bytes, now: Instant) -> Iterator[tuple[str, bytes]]:
-    border.notice(Failsafe[body.decode()], now)
+def _notice(guard: Guard, body: bytes, now: Instant) -> Iterator[tuple[str, bytes]]:
+    guard.notice(Failsafe[body.decode()], now)
     return iter(())
 
 

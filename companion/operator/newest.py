@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from math import isfinite
 
-from companion.core.trajectory import FleetTrajectory
+from companion.core.trajectory.fleet import FleetTrajectory
 from companion.core.trajectory_check import REVISION_JUMP_MAX
 from companion.errors import WireError
 from companion.wire.operator import Status

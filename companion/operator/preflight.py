@@ -13,7 +13,8 @@ from typing import Any
 
 from companion.config import FleetConfig
 from companion.core.formation import minimum_distance
-from companion.core.trajectory import top_speed_m_s, with_legs
+from companion.core.trajectory.fleet import top_speed_m_s
+from companion.core.trajectory.successors import with_legs
 from companion.core.trajectory_check import ALTITUDE_MIN_M, PLAN_SPEED_SHARE, SPEED_SLACK
 from companion.core.values import ZERO
 from companion.operator.clocks import ClockOffset

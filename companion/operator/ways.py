@@ -6,7 +6,7 @@ from math import hypot, sqrt
 
 from companion.core.frames import Ned
 from companion.core.safety.filter import DOWNWASH_RATIO
-from companion.core.trajectory import FleetTrajectory
+from companion.core.trajectory.fleet import FleetTrajectory
 
 Point = tuple[float, float, float] | Ned
 """north, east, down (m, fleet frame)"""

@@ -6,8 +6,8 @@ from companion.config import FleetConfig
 from companion.core.failsafe import LISTEN_S
 from companion.core.frames import Ned
 from companion.core.health import JumpSeries, PositionWatch
-from companion.core.neighbours import PeerTable
-from companion.core.trajectory import TrajectoryHistory
+from companion.core.neighbours.table import PeerTable
+from companion.core.trajectory.history import TrajectoryHistory
 from companion.core.values import FILTERED_PHASES, FLYING_PHASES, ZERO, Instant, Phase
 from companion.vehicle.autopilot.port import HOLD, AutopilotPort, FlightMode
 

@@ -7,7 +7,7 @@ from math import dist, hypot
 from companion.core.failsafe import LISTEN_S
 from companion.core.phase import PhaseEvent
 from companion.core.rejoin import RejoinTrajectory
-from companion.core.trajectory import Reference
+from companion.core.trajectory.fleet import Reference
 from companion.core.values import FORMATION_PHASES, ZERO, Instant, Phase, VehicleState
 from companion.vehicle.flight import Flight
 

@@ -23,9 +23,10 @@ from companion.core.events import (
 from companion.core.failsafe import FAILSAFES, Action, Failsafe
 from companion.core.frames import Ned
 from companion.core.health import FallWatch, PositionWatch
-from companion.core.neighbours import PeerTable
+from companion.core.neighbours.table import PeerTable
 from companion.core.phase import PhaseEvent, next_phase
-from companion.core.trajectory import Reference, TrajectoryHistory
+from companion.core.trajectory.fleet import Reference
+from companion.core.trajectory.history import TrajectoryHistory
 from companion.core.values import FILTERED_PHASES, FLYING_PHASES, SETTLED_PHASES, Instant, Phase, VehicleState
 from companion.vehicle.autopilot.port import LAND, OFFBOARD, TAKE_OFF, AutopilotPort, Verb
 from companion.vehicle.detectors import DETECTORS, Finding, Note
@@ -110,22 +111,17 @@ class Supervisor:
         """Whether a peer holds a newer motion than we do."""
         return self.flight.outdated
 
-    @property
-    def position_jumps(self) -> int:
-        """How often the own position has jumped."""
-        return self.flight.positions.jumps
-
     def state(self, now: Instant) -> tuple[Ned, Ned] | None:
         """Position and velocity to steer by (fleet frame); None while there are none to trust."""
         return None if self.flight.positions.frozen else self.autopilot.state(now)
 
     # -- what others tell ----------------------------------------------------------------------------------------------
 
-    def position_came(self) -> None:
-        """The autopilot has told a new position."""
+    def position_came(self) -> bool:
+        """The autopilot has told a new position; whether it is a jump."""
         ap = self.autopilot
         assert ap.position_ns is not None
-        self.flight.positions.see(ap.position_ns, ap.position_ned_m, ap.velocity_ned_m_s)
+        return self.flight.positions.see(ap.position_ns, ap.position_ned_m, ap.velocity_ned_m_s)
 
     def heard_order(self, newer: bool) -> None:
         """A peer has told which motion it holds: `newer` than the own newest, or not."""

@@ -11,7 +11,7 @@ from typing import Any, get_type_hints
 
 from companion.core import events
 from companion.core.events import Event
-from companion.core.trajectory import FleetTrajectory
+from companion.core.trajectory.fleet import FleetTrajectory
 from companion.errors import WireError
 from companion.wire.peer import motion_from_json, motion_to_json
 

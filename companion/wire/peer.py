@@ -1,16 +1,18 @@
 """Peer messages as bytes: little-endian, fixed layout, a version in front.
 
     header  B version, B vehicle id, B phase, B digest entries, I boot id, I sequence, I revision, q motion start ns,
-            B motion issuer, B flags (1: the next message is due soon), B near ids
+            B motion issuer, B flags (1: the next message is due soon; 2: numbers of the law follow), B near ids
     sample  q time ns, 3f position (m), 3f velocity (m/s)                                  fleet frame, NED
     digest  for each entry: B vehicle id, B phase, I revision, sample
     near    for each id: B vehicle id, ascending
+    law     with flag 2: B count (1 to FIELDS_MAX), f each
 
 A motion travels as JSON (`encode_motion`): it is rare, and a person can read it in a capture.
 """
 
 import json
 import struct
+from collections.abc import Collection
 from itertools import pairwise
 from math import isfinite
 from typing import Annotated, Any, Literal
@@ -18,16 +20,11 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from companion.core.frames import Ned
-from companion.core.trajectory import (
-    BLEND_MIN_S,
-    GOTO_MIN_S,
-    FleetTrajectory,
-    GotoLeg,
-    Leg,
-    SlotChange,
-    TurnLeg,
-    VelocityLeg,
-)
+from companion.core.law.base import FIELDS_MAX
+from companion.core.trajectory.fleet import REVISIONS, FleetTrajectory
+from companion.core.trajectory.goto import GOTO_MIN_S
+from companion.core.trajectory.legs import GotoLeg, Leg, TurnLeg, VelocityLeg
+from companion.core.trajectory.slots import BLEND_MIN_S, SlotChange
 from companion.core.trajectory_check import (
     DURATION_MAX_S,
     HEADING_MAX_RAD,
@@ -52,6 +49,8 @@ PLAUSIBLE_MAX = 1e6
 """no position (m) or velocity (m/s) is larger than this: float32 holds far more, and squares of it overflow later"""
 DUE_SOON = 1
 """flag: the next message is due within `trigger.near_period_s` and a control period"""
+TOLD = 2
+"""flag: numbers of the sender's law follow"""
 _HEADER = struct.Struct("<BBBBIIIqBBB")
 _SAMPLE = struct.Struct("<q6f")
 _ENTRY = struct.Struct("<BBI")
@@ -60,16 +59,19 @@ _ENTRY = struct.Struct("<BBI")
 def encode_state(message: PeerMessage) -> bytes:
     """A state message's payload."""
     s = message.sample
+    flags = DUE_SOON * message.due_soon | TOLD * bool(message.told)
     parts = [
         _HEADER.pack(
             VERSION, s.vehicle_id, s.phase, len(message.digest), message.boot_id, message.sequence, s.revision,
-            message.motion_start_ns, message.motion_issuer, DUE_SOON * message.due_soon, len(message.near_ids),
+            message.motion_start_ns, message.motion_issuer, flags, len(message.near_ids),
         ),
         _sample_bytes(s),
     ]  # fmt: skip
     for entry in message.digest:
         parts += [_ENTRY.pack(entry.vehicle_id, entry.phase, entry.revision), _sample_bytes(entry)]
     parts.append(bytes(message.near_ids))
+    if message.told:
+        parts.append(struct.pack(f"<B{len(message.told)}f", len(message.told), *message.told))
     return b"".join(parts)
 
 
@@ -87,12 +89,14 @@ def decode_state(payload: bytes) -> PeerMessage:
     _, vehicle_id, phase, entries, boot_id, sequence, revision, start_ns, issuer, flags, near = _HEADER.unpack_from(
         payload
     )
-    each = _ENTRY.size + _SAMPLE.size
-    if len(payload) != _HEADER.size + _SAMPLE.size + entries * each + near:
-        raise WireError("length")
-    if flags & ~DUE_SOON:
+    if flags & ~(DUE_SOON | TOLD):
         raise WireError("flags")
-    near_ids = tuple(payload[len(payload) - near :])
+    each = _ENTRY.size + _SAMPLE.size
+    end = _HEADER.size + _SAMPLE.size + entries * each + near
+    told = _told(payload, end) if flags & TOLD else ()
+    if len(payload) != end + (1 + 4 * len(told) if flags & TOLD else 0):
+        raise WireError("length")
+    near_ids = tuple(payload[end - near : end])
     if any(a >= b for a, b in pairwise(near_ids)):
         raise WireError("near ids")
     sample = _sample(payload, _HEADER.size, vehicle_id, phase, revision)
@@ -100,13 +104,29 @@ def decode_state(payload: bytes) -> PeerMessage:
     for k in range(entries):
         at = _HEADER.size + _SAMPLE.size + k * each
         digest.append(_sample(payload, at + _ENTRY.size, *_ENTRY.unpack_from(payload, at)))
-    return PeerMessage(boot_id, sequence, start_ns, issuer, sample, tuple(digest), near_ids, bool(flags & DUE_SOON))
+    return PeerMessage(
+        boot_id, sequence, start_ns, issuer, sample, tuple(digest), near_ids, bool(flags & DUE_SOON), told
+    )
+
+
+def _told(payload: bytes, at: int) -> tuple[float, ...]:
+    """The numbers of the sender's law, of which there are some."""
+    count = payload[at] if len(payload) > at else 0
+    if not 0 < count <= FIELDS_MAX or len(payload) < at + 1 + 4 * count:
+        raise WireError("length")
+    numbers: tuple[float, ...] = struct.unpack_from(f"<{count}f", payload, at + 1)
+    _examine(numbers)
+    return numbers
+
+
+def _examine(numbers: Collection[float]) -> None:
+    if not all(abs(x) <= PLAUSIBLE_MAX for x in numbers):
+        raise WireError("not finite" if not all(map(isfinite, numbers)) else "out of range")
 
 
 def _sample(payload: bytes, at: int, vehicle_id: int, phase: int, revision: int) -> PeerSample:
     time_ns, *numbers = _SAMPLE.unpack_from(payload, at)
-    if not all(abs(x) <= PLAUSIBLE_MAX for x in numbers):
-        raise WireError("not finite" if not all(map(isfinite, numbers)) else "out of range")
+    _examine(numbers)
     try:
         known = Phase(phase)
     except ValueError:
@@ -151,7 +171,7 @@ class _GotoLeg(_Model):
 
 class _Motion(_Model):
     version: Literal[3]
-    revision: Annotated[int, Field(ge=0, lt=1 << 32)]
+    revision: Annotated[int, Field(ge=0, lt=REVISIONS)]
     start_ns: Annotated[int, Field(ge=0, lt=1 << 63)]
     issuer: Annotated[int, Field(ge=0, le=255)]
     shape: Annotated[str, Field(max_length=32)]

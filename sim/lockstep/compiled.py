@@ -19,8 +19,8 @@ MODULES = (
         "commander", "estimator", "events", "link", "navigator", "offboard", "parameters", "services", "telemetry",
     )),
     *(f"companion/core/{name}.py" for name in (
-        "estimate", "frames", "law/starling", "neighbours", "prediction", "safety/filter", "trajectory", "trigger",
-        "values", "vectors",
+        "estimate", "frames", "law/base", "law/starling", "neighbours", "prediction", "safety/filter", "trajectory",
+        "trigger/base", "trigger/error", "trigger/periodic", "trigger/switching", "values", "vectors",
     )),
 )  # fmt: skip
 """what costs most of a flight, and what those build on; the rest is interpreted as ever"""

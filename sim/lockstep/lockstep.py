@@ -19,7 +19,8 @@ from companion.core.events import Event
 from companion.core.failsafe import Failsafe
 from companion.core.frames import Ned
 from companion.core.values import Instant, Phase
-from companion.vehicle.agent import Agent, Outputs
+from companion.vehicle.agent import Agent
+from companion.vehicle.outputs import Outputs
 from companion.wire.events import encode_event
 from sim.autopilot.autopilot import Autopilot
 from sim.autopilot.stub_fleet import stub_settings
@@ -312,7 +313,7 @@ class Lockstep:
         if not isinstance(order, dict) or "after" in order:
             return payload
         self._orders += 1
-        after = {i: [v.agent.orders.place(v.agent.supervisor.begun)] for i, v in self.vehicles.items()}
+        after = {i: [v.agent.operator.place] for i, v in self.vehicles.items()}
         return json.dumps({"issuer": "lockstep", **order, "id": f"{self._orders}", "after": after}).encode()
 
     def stall(self, i: int, seconds: float) -> None:

@@ -9,7 +9,10 @@ from math import cos, inf, pi, sin
 from random import Random
 
 from companion.core.frames import Ned
-from companion.core.trajectory import FleetTrajectory, GotoLeg, Leg, SlotChange, TurnLeg, VelocityLeg, with_legs
+from companion.core.trajectory.fleet import FleetTrajectory
+from companion.core.trajectory.legs import GotoLeg, Leg, TurnLeg, VelocityLeg
+from companion.core.trajectory.slots import SlotChange
+from companion.core.trajectory.successors import with_legs
 from companion.core.values import ZERO, PeerMessage, PeerSample, Phase
 from companion.wire.peer import decode_state, encode_motion, encode_state
 

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from math import hypot
 
 from companion.core.frames import Ned
-from companion.core.law.starling import Law
-from companion.core.trajectory import Reference
-from companion.core.values import Command, Neighbour, VehicleState
+from companion.core.law.base import Law, Wanted
+from companion.core.trajectory.fleet import Reference
+from companion.core.values import Neighbour, VehicleState
 
 GAIN_PER_S = 3.0
 PUSH_MAX_M_S2 = 5.0
@@ -23,12 +23,25 @@ class BrokenLaw:
 
     def command(
         self, ego: VehicleState, reference: Reference, neighbours: Sequence[Neighbour], *, alone: bool
-    ) -> tuple[Command, Ned]:
-        """The sound law's command and residual, or the broken command in its place."""
-        command, residual = self.sound.command(ego, reference, neighbours, alone=alone)
+    ) -> Wanted:
+        """What the sound law wants, or the broken command in its place."""
+        sound = self.sound.command(ego, reference, neighbours, alone=alone)
         wanted, v = self.velocity_ned_m_s, ego.velocity_ned_m_s
         if wanted is None:
-            return command, residual
+            return sound
         north, east = GAIN_PER_S * (wanted.north - v.north), GAIN_PER_S * (wanted.east - v.east)
         over = max(hypot(north, east) / PUSH_MAX_M_S2, 1.0)
-        return command._replace(acceleration_ned_m_s2=Ned(north / over, east / over, 0.0)), residual
+        return Wanted(Ned(north / over, east / over, 0.0), sound.residual_ned_m)
+
+    def reset(self) -> None:
+        """See `Law`."""
+        self.sound.reset()
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """See `Law`."""
+        return self.sound.fields
+
+    def tell(self) -> tuple[float, ...]:
+        """See `Law`."""
+        return self.sound.tell()

@@ -91,9 +91,9 @@ def meet(
     laws = {}
     for i, v in fleet.vehicles.items():
         if near == "off":
-            v.agent.near = NeverNear(v.agent.near.rate)
+            v.agent.publisher.near = NeverNear(v.agent.publisher.near.rate)
         v.agent.law = laws[i] = BrokenLaw(v.agent.law)
-    fleet.run_until(READY_S, lambda: not any(v.agent.unready(fleet.now) for v in fleet.vehicles.values()))
+    fleet.run_until(READY_S, lambda: not any(v.agent.operator.unready(fleet.now) for v in fleet.vehicles.values()))
     fleet.command(b'{"verb":"takeoff"}')
     fleet.run_until(fleet.now_ns * 1e-9 + CLIMB_S, lambda: fleet.all_in(Phase.WAITING))
     if not fleet.all_in(Phase.WAITING):

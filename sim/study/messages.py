@@ -12,7 +12,7 @@ import numpy as np
 from companion.config import FleetConfig, load
 from companion.core.values import Phase
 from companion.errors import ConfigError
-from companion.vehicle.agent import CAUSES
+from companion.vehicle.publisher import CAUSES
 from sim.lockstep.lockstep import Lockstep
 from sim.lockstep.network import NetworkParameters
 from sim.measures import minimum_distance_m
@@ -63,7 +63,7 @@ def _config(fleet: Fleet, case: Case) -> FleetConfig:
 def _count(ls: Lockstep) -> Counter[str]:
     total: Counter[str] = Counter()
     for v in ls.vehicles.values():
-        total.update(v.agent.sent_because)
+        total.update(v.agent.publisher.sent_because)
     return total
 
 
@@ -74,8 +74,8 @@ def fly(fleet: Fleet, case: Case, seed: int) -> Record:
     )  # fmt: skip
     if not case.near:
         for v in ls.vehicles.values():
-            v.agent.near = NeverNear(v.agent.near.rate)
-    ls.run_until(READY_S, lambda: not any(v.agent.unready(ls.now) for v in ls.vehicles.values()))
+            v.agent.publisher.near = NeverNear(v.agent.publisher.near.rate)
+    ls.run_until(READY_S, lambda: not any(v.agent.operator.unready(ls.now) for v in ls.vehicles.values()))
     before, began_ns = _count(ls), ls.now_ns
     ls.command(b'{"verb":"takeoff"}')
     marks = []

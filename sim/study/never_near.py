@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 
-from companion.core.near import NearMode
+from companion.core.trigger.near import NearMode
 
 
 class NeverNear(NearMode):

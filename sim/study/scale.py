@@ -6,8 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from companion.core.law.intent import IntentGains
-from companion.core.trigger import ErrorTrigger
 from sim.study.common import Column, Config, Figure, Outcome, Record, Table, statistics
 from sim.study.figures import BLUE, GREEN, GREY, RED, panels
 from sim.swarm import swarm
@@ -26,12 +24,15 @@ def step_costs(setup: Setup, seed: int, steps: int, relative_speed_m_s: float) -
     """CPU time of each part of a control step, median of `steps` steps, one thread.
 
     The agents move with the plan and against each other at `relative_speed_m_s`, each along its own direction, turning
-    round every two seconds; the law runs on them as it would in flight (hold, trigger, list, law, then the filter).
+    round every two seconds; everything runs on them as in any other study, but for their dynamics.
     """
     loops = kernels()
+    from sim.swarm import exchange
+
     n = setup.formation.count
-    o = swarm.run_options(setup)
-    table = reference_table(setup, steps + 1)
+    plain, filtered = (swarm.run_options(replace(setup, barrier=b)) for b in (False, True))
+    g, ig, et, st, it = swarm.rules_of(setup)
+    table = reference_table(setup, steps + 6)
     x, v = starts(setup, seed)
     rng = np.random.default_rng([seed, 5])
     way = rng.normal(size=(n, 3))
@@ -39,43 +40,40 @@ def step_costs(setup: Setup, seed: int, steps: int, relative_speed_m_s: float) -
     near = NeighbourList(setup.range_m)
     # sorted by cell, so that neighbours in space are neighbours in memory
     order = near.sorted_order(x)
-    x, v, way, offset = x[order].copy(), v[order].copy(), way[order], setup.formation.slots()[order].copy()
-    sent, sent_step = np.zeros((n, loops.SAMPLE)), np.full(n, -1, dtype=np.int64)
-    limit, residual, slot = np.zeros(n), np.zeros((n, 3)), np.zeros((n, 3))
-    rows, own, u = np.zeros((n, 9)), np.zeros(12), np.zeros((n, 3))
-    keys = swarm.agent_keys(seed, n)
-    g, et = swarm.gains(setup), ErrorTrigger(setup.epsilon_m, setup.gamma_s2, setup.kappa)
-    ig = IntentGains(1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
-    planes, spare = np.zeros((512, 5)), np.zeros((512, 3))
-    whole, barriers, rebuilds, messages = [], [], 0, 0
+    way = way[order]
+    s = swarm.state_of(
+        setup, seed, plain, table, x[order].copy(), v[order].copy(), setup.formation.slots()[order], near
+    )
+    whole, barriers, rebuilt, messages = [], [], 0, 0
     turn = round(2.0 / setup.dt_s)
     for k in range(steps + 5):
-        at = min(k, steps)
-        sign = 1.0 if (k // turn) % 2 == 0 else -1.0
-        v[:] = np.array(setup.velocity_m_s) + sign * way
+        s.v[:] = np.array(setup.velocity_m_s) + (1.0 if (k // turn) % 2 == 0 else -1.0) * way
         begin = time.thread_time_ns()
-        rebuilt = near.update(x)
-        messages += loops.hold_and_trigger_fast(
-            at, x, v, sent, sent_step, limit, residual, slot, table, rows, own, keys, o, ig, et, offset
-        )
-        loops.law_fast(x, v, rows, slot, near.start, near.column, setup.range_m**2, table[at, 0], g, u, residual)
+        s = swarm.with_list(s, near)
+        loops.place_slots(k, s, table)
+        loops.measure(k, s, plain)
+        loops.filter_own(k, s, plain)
+        exchange.send(k, k, s, table, plain, et, st, it, ig)
+        exchange.predict_all(k, s, table, plain, ig)
+        law = time.thread_time_ns()
+        loops.command(k, s, table, plain, g, ig)
         middle = time.thread_time_ns()
-        loops.barrier_fast(x, v, rows, near.start, near.column, 5.0, setup.barrier_radius_m,
-                           setup.avoidance_max_m_s2, table[at, 0], planes, spare, u)  # fmt: skip
+        loops.command(k, s, table, filtered, g, ig)
         end = time.thread_time_ns()
-        x += setup.dt_s * v
+        s.x[:] += setup.dt_s * s.v
+        if k == 4:
+            rebuilt, messages = near.rebuilt, int(s.counts[0])
         if k >= 5:
             whole.append((middle - begin) * 1e-6)
-            barriers.append((end - middle) * 1e-6)
-            rebuilds += rebuilt
+            barriers.append((end - middle - (middle - law)) * 1e-6)
     return {
         "count": n,
-        "neighbours": float(near.within_range(x)),
+        "neighbours": float(near.within_range(s.x)),
         "step_ms": float(np.median(whole)),
         "step_mean_ms": float(np.mean(whole)),
         "filter_ms": float(np.median(barriers)),
-        "rebuilds": rebuilds,
-        "messages": messages,
+        "rebuilds": near.rebuilt - rebuilt,
+        "messages": int(s.counts[0]) - messages,
     }
 
 

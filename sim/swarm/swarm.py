@@ -20,11 +20,11 @@ import numpy.typing as npt
 from companion.core.formation import SHAPES
 from companion.core.law.intent import IntentGains, IntentTrigger
 from companion.core.law.starling import Gains
-from companion.core.trigger import ErrorTrigger, SwitchingTrigger
+from companion.core.safety.filter import COLLISION_DISTANCE_M, LAG_ALLOWANCE_M
+from companion.core.trigger.error import ErrorTrigger
+from companion.core.trigger.switching import SwitchingTrigger
 from companion.errors import ConfigError
-
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
+from sim.swarm.state import MEASURES, ROW, SAMPLE, Floats, Ints, Options, State
 
 DENSE_MAX = 200
 """up to here every ordered pair may have its own row"""
@@ -440,8 +440,9 @@ def run_options(setup: Setup) -> Any:
     own_held = setup.reading in ("V1", "V1b")
     elastic = setup.trigger == "elastic"
     fault = setup.fault != "none"
-    return kernels().Options(
+    return Options(
         dt=setup.dt_s,
+        dt_ns=round(setup.dt_s * 1e9),
         every=setup.control_every,
         hold=_HOLDS[setup.hold],
         damping=setup.damping_s,
@@ -449,6 +450,7 @@ def run_options(setup: Setup) -> Any:
         t_min=setup.t_min_s,
         t_max=setup.t_max_s,
         period=setup.period_s,
+        period_ns=max(round(setup.period_s * 1e9), 1),
         mode_by_residual=int(setup.mode_by_residual),
         count_start=int(setup.count_start),
         leaderless=int(not setup.plan),
@@ -466,7 +468,7 @@ def run_options(setup: Setup) -> Any:
         digest=min(setup.digest, setup.formation.count - 1),
         gates_after=setup.gates_after_s,
         barrier=int(setup.barrier),
-        barrier_radius=setup.barrier_radius_m,
+        uncertainty=setup.barrier_radius_m - COLLISION_DISTANCE_M - LAG_ALLOWANCE_M,
         avoidance_max=setup.avoidance_max_m_s2,
         sigma_p=setup.sigma_p_m,
         sigma_p_time=setup.sigma_p_time_s,
@@ -513,8 +515,10 @@ class NeighbourList:
 
     def update(self, x: Floats) -> bool:
         """Make the list good for positions x, shape (N, 3); returns whether it had to be rebuilt."""
-        loops = kernels()
-        if self._then is not None and loops.largest_shift(x, self._then) <= SKIN_M / 2:
+        kernels()
+        from sim.swarm import grid
+
+        if self._then is not None and grid.largest_shift(x, self._then) <= SKIN_M / 2:
             return False
         reach = self.range_m + SKIN_M
         low = x.min(axis=0)
@@ -525,11 +529,11 @@ class NeighbourList:
         count = np.zeros(int(shape.prod()) + 1, dtype=np.int64)
         cell = np.zeros(len(x), dtype=np.int64)
         order = np.zeros(len(x), dtype=np.int64)
-        loops.cells(x, low, width, shape, cell, count, order)
+        grid.cells(x, low, width, shape, cell, count, order)
         self.start = np.zeros(len(x) + 1, dtype=np.int64)
         column = self.column if self.column.size else np.zeros(64 * len(x), dtype=np.int64)
         while True:
-            needed = loops.listed(x, low, width, shape, count, order, reach, self.start, column)
+            needed = grid.listed(x, low, width, shape, count, order, reach, self.start, column)
             if needed <= column.size:
                 break
             column = np.zeros(int(needed * 1.1), dtype=np.int64)
@@ -550,6 +554,77 @@ class NeighbourList:
         return float(near.sum() / len(x))
 
 
+def rules_of(setup: Setup) -> tuple[Gains, IntentGains, ErrorTrigger, SwitchingTrigger, IntentTrigger]:
+    """Gains and thresholds of every law and trigger, as the kernels take them."""
+    return (
+        gains(setup),
+        IntentGains(
+            setup.intent_k_p, setup.intent_k_d, setup.intent_c_g, setup.intent_c_max, setup.saturation_m,
+            setup.saturation_m_s,
+        ),
+        ErrorTrigger(setup.epsilon_m, setup.gamma_s2, setup.kappa),
+        SwitchingTrigger(setup.gamma_s2, setup.alpha, setup.beta, setup.delta_min, setup.delta_f, setup.eta),
+        IntentTrigger(setup.intent_epsilon_m, setup.intent_kappa),
+    )  # fmt: skip
+
+
+def with_list(s: Any, near: NeighbourList) -> Any:
+    """The state with a neighbour list that is good for its positions, and room for as many neighbours."""
+    if not near.update(s.x):
+        return s
+    width = int(np.diff(near.start).max()) + 1
+    return s._replace(start=near.start, column=near.column, **_room(width))
+
+
+def _room(width: int) -> dict[str, Any]:
+    """Where one agent's neighbours are laid out."""
+    return {
+        "near": np.zeros((width, ROW)), "near_row": np.zeros(width, dtype=np.int64),
+        "planes": np.zeros((width, 5)), "spare": np.zeros((width, 3)), "scratch": np.zeros((2, width)),
+    }  # fmt: skip
+
+
+def state_of(
+    setup: Setup, seed: int, o: Any, table: Floats, x: Floats, v: Floats, slots: Floats, near: "NeighbourList | None"
+) -> Any:
+    """The kernels' state at the start; every pair is listed where no neighbour list is given."""
+    n = len(x)
+    steps = round(setup.duration_s / setup.dt_s)
+    start = np.arange(n + 1, dtype=np.int64) * (n - 1)
+    if near is None:
+        column = np.array([j for i in range(n) for j in range(n) if j != i], dtype=np.int64)
+    else:
+        near.update(x)
+        start, column = near.start, near.column
+    rows = n * (n - 1) if o.links else n
+    kept = -(-steps // setup.keep_every)
+    depth = o.delay + 1 if o.links else 1
+    ring_digest = max(o.digest, 1)
+    s = State(
+        x=x, v=v, a=np.zeros((n, 3)), gust=np.zeros((n, 3)), bias=np.zeros((n, 3)), measured=np.zeros((n, 6)),
+        filtered=np.zeros((n, 6)), u=np.zeros((n, 3)), common=np.zeros((n, 3)), anchor=np.zeros((n, 3)),
+        anchor_speed=np.zeros((n, 3)), sent=np.zeros((n, SAMPLE)), sent_step=np.full(n, -1, dtype=np.int64),
+        limit=np.zeros(n), clock=np.zeros(n), own=np.zeros((n, 12)), residual=np.zeros((n, 3)), neighbours=np.zeros(n),
+        observed=np.zeros((n, 6)), predicted=np.zeros((rows, 12)),
+        held=np.zeros((rows if o.links else 1, SAMPLE)),
+        held_step=np.full(rows if o.links else 1, -1, dtype=np.int64), stopped=np.zeros((rows, 3)),
+        offset=np.ascontiguousarray(slots), slot=np.zeros((n, 3)),
+        start=start, column=column,
+        ring=np.zeros((depth, n if o.links else 1, SAMPLE)),
+        ring_step=np.full((depth, n), -1, dtype=np.int64),
+        ring_digest=np.zeros((depth, n if o.links else 1, ring_digest, SAMPLE)),
+        ring_digest_step=np.zeros((depth, n if o.links else 1, ring_digest), dtype=np.int64),
+        ring_digest_id=np.full((depth, n if o.links else 1, ring_digest), -1, dtype=np.int64),
+        outage=np.zeros(rows, dtype=np.uint8), keys=agent_keys(seed, n),
+        **_room(int(np.diff(start).max()) + 1),
+        measures=np.array([1e9, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]),
+        events=np.zeros((n * (steps // setup.control_every + 1), 2), dtype=np.int64),
+        counts=np.zeros(5, dtype=np.int64), record=np.zeros((kept, n, 6)), record_u=np.zeros((kept, n, 3)),
+    )  # fmt: skip
+    _start_estimates(s, setup, table, o)
+    return s
+
+
 def run(setup: Setup, seed: int, *, reference: Floats | None = None, start: tuple[Floats, Floats] | None = None) -> Run:
     """Fly one set-up under one seed. `reference`, shape (steps, 1 or N, 9), replaces the plan's table."""
     if not connected(setup.formation.slots(), setup.range_m):
@@ -561,61 +636,19 @@ def run(setup: Setup, seed: int, *, reference: Floats | None = None, start: tupl
     steps = round(setup.duration_s / setup.dt_s)
     table = reference_table(setup, steps + 1) if reference is None else reference
     x, v = starts(setup, seed) if start is None else (start[0].copy(), start[1].copy())
-    o = run_options(setup)
-    dense = n <= DENSE_MAX
-    pairs = n * (n - 1)
-    columns = np.array([j for i in range(n) for j in range(n) if j != i], dtype=np.int64) if dense else None
-    near = NeighbourList(setup.range_m)
-    if columns is None:
-        near.update(x)
-    rows = pairs if o.links else n
     slots = setup.formation.slots() if table.shape[1] == 1 else np.zeros((n, 3))
-    kept = -(-steps // setup.keep_every)
-    most = n * (steps // setup.control_every + 1)
-    depth = o.delay + 1 if o.links else 1
-    ring_digest = max(o.digest, 1)
-    width = n if dense else int(np.diff(near.start).max()) * 2 + 64
-    s = loops.State(
-        x=x, v=v, a=np.zeros((n, 3)), gust=np.zeros((n, 3)), bias=np.zeros((n, 3)), measured=np.zeros((n, 6)),
-        filtered=np.zeros((n, 6)), u=np.zeros((n, 3)), common=np.zeros((n, 3)), anchor=np.zeros((n, 3)),
-        anchor_speed=np.zeros((n, 3)), sent=np.zeros((n, loops.SAMPLE)), sent_step=np.full(n, -1, dtype=np.int64),
-        limit=np.zeros(n), clock=np.zeros(n), own=np.zeros((n, 12)), residual=np.zeros((n, 3)), neighbours=np.zeros(n),
-        observed=np.zeros((n, 6)), predicted=np.zeros((rows, 12)),
-        held=np.zeros((rows if o.links else 1, loops.SAMPLE)),
-        held_step=np.full(rows if o.links else 1, -1, dtype=np.int64), stopped=np.zeros((rows, 3)),
-        offset=np.ascontiguousarray(slots), slot=np.zeros((n, 3)),
-        start=np.arange(n + 1, dtype=np.int64) * (n - 1) if columns is not None else near.start,
-        column=columns if columns is not None else near.column,
-        ring=np.zeros((depth, n if o.links else 1, loops.SAMPLE)),
-        ring_step=np.full((depth, n), -1, dtype=np.int64),
-        ring_digest=np.zeros((depth, n if o.links else 1, ring_digest, loops.SAMPLE)),
-        ring_digest_step=np.zeros((depth, n if o.links else 1, ring_digest), dtype=np.int64),
-        ring_digest_id=np.full((depth, n if o.links else 1, ring_digest), -1, dtype=np.int64),
-        outage=np.zeros(rows, dtype=np.uint8), keys=agent_keys(seed, n), planes=np.zeros((width, 5)),
-        spare=np.zeros((width, 3)), scratch=np.zeros((2, width)),
-        measures=np.array([1e9, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]), events=np.zeros((most, 2), dtype=np.int64),
-        counts=np.zeros(5, dtype=np.int64), record=np.zeros((kept, n, 6)), record_u=np.zeros((kept, n, 3)),
-    )  # fmt: skip
-    _start_estimates(s, setup, table, o)
-    g = gains(setup)
-    ig = IntentGains(
-        setup.intent_k_p, setup.intent_k_d, setup.intent_c_g, setup.intent_c_max, setup.saturation_m,
-        setup.saturation_m_s,
-    )  # fmt: skip
-    et = ErrorTrigger(setup.epsilon_m, setup.gamma_s2, setup.kappa)
-    st = SwitchingTrigger(setup.gamma_s2, setup.alpha, setup.beta, setup.delta_min, setup.delta_f, setup.eta)
-    it = IntentTrigger(setup.intent_epsilon_m, setup.intent_kappa)
-    if dense:
-        loops.advance(0, steps, setup.keep_every, s, table, o, g, ig, et, st, it)
+    o, rules = run_options(setup), rules_of(setup)
+    near = None if n <= DENSE_MAX else NeighbourList(setup.range_m)
+    s = state_of(setup, seed, o, table, x, v, slots, near)
+    if near is None:
+        loops.advance(0, steps, setup.keep_every, s, table, o, *rules)
     else:
         for k in range(steps):
-            if near.update(s.x):
-                most_near = int(np.diff(near.start).max()) + 1
-                s = s._replace(start=near.start, column=near.column, planes=np.zeros((most_near, 5)),
-                               spare=np.zeros((most_near, 3)), scratch=np.zeros((2, most_near)))  # fmt: skip
-            loops.advance(k, k + 1, setup.keep_every, s, table, o, g, ig, et, st, it)
-    if s.counts[0] > most:
-        raise RuntimeError(f"{s.counts[0]} events, room for {most}")
+            s = with_list(s, near)
+            loops.advance(k, k + 1, setup.keep_every, s, table, o, *rules)
+    if s.counts[0] > len(s.events):
+        raise RuntimeError(f"{s.counts[0]} events, room for {len(s.events)}")
+    kept = len(s.record)
     kept_steps = np.arange(kept) * setup.keep_every
     centre = np.broadcast_to(table[kept_steps], (kept, n, 9))
     place = centre[:, :, :6].copy()
@@ -634,7 +667,7 @@ def run(setup: Setup, seed: int, *, reference: Floats | None = None, start: tupl
         steps_dynamic=int(s.counts[2]),
         steps_fixed=int(s.counts[3]),
         filter_active=int(s.counts[4]),
-        measures=dict(zip(loops.MEASURES, map(float, s.measures), strict=True)),
+        measures=dict(zip(MEASURES, map(float, s.measures), strict=True)),
     )
 
 

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from pymavlink.dialects.v20 import development as dialect
 
 from companion.config import FleetConfig, load
-from companion.core.trajectory import TrajectoryHistory
+from companion.core.trajectory.history import TrajectoryHistory
 from companion.core.values import Instant, Phase
 from companion.io.recorder import Entry
 from companion.wire.operator import encode
@@ -76,7 +76,7 @@ def launch(
     """A fleet that has just accepted its take-off."""
     ls = Lockstep(config, seed=seed, network=network or NetworkParameters(), record=record)
     ls.run_until(READY_S)
-    ls.run_until(READY_S + 10.0, lambda: not any(v.agent.unready(ls.now) for v in ls.vehicles.values()))
+    ls.run_until(READY_S + 10.0, lambda: not any(v.agent.operator.unready(ls.now) for v in ls.vehicles.values()))
     answers = [json.loads(a) for a in ls.command(b'{"verb":"takeoff"}').values()]
     assert all(a["accepted"] for a in answers), answers
     return ls

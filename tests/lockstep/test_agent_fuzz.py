@@ -38,7 +38,7 @@ IDS = itertools.count()
 
 def ordered(agent: Agent, motion: bytes) -> bytes:
     """A command to fly a motion, given at a vehicle's place."""
-    head = {"id": f"{next(IDS)}", "issuer": "x", "after": {agent.id: [agent.orders.place(agent.supervisor.begun)]}}
+    head = {"id": f"{next(IDS)}", "issuer": "x", "after": {agent.id: [agent.operator.place]}}
     return b'{"verb":"motion",%s,"motion":%s}' % (json.dumps(head)[1:-1].encode(), motion)
 
 
@@ -381,7 +381,7 @@ class Calls:
 
 
 def give(agent: Agent, given: Input, now: Instant) -> None:
-    """Hand an input to an agent as its process does, without the border that catches what raises."""
+    """Hand an input to an agent as its process does, without the guard that catches what raises."""
     match given.kind:
         case "plan" | "state":
             agent.receive_peer(given.key, given.payload, now)
@@ -392,7 +392,7 @@ def give(agent: Agent, given: Input, now: Instant) -> None:
         case "status":
             assert len(encode(agent.status(now))) < 40_000
         case "preflight":
-            assert len(encode(agent.account(now))) < 40_000
+            assert len(encode(agent.operator.preflight_report(now))) < 40_000
 
 
 def flooded(seed: int, count: int) -> tuple[int, int, int]:

@@ -116,7 +116,7 @@ def test_an_accuracy_that_is_none_takes_nobody_off_and_lands_who_flies(accuracy_
     ls = NoAccuracy(fleet(1))
     ls.accuracy_m = accuracy_m
     ls.run_until(6.0)
-    assert any(says.startswith("position uncertain by") for says in ls.vehicles[1].agent.unready(ls.now))
+    assert any(says.startswith("position uncertain by") for says in ls.vehicles[1].agent.operator.unready(ls.now))
     ls.begin_s = 1e9
     wait(ls, 3.0)
     ls.command(b'{"verb":"takeoff"}')

@@ -352,8 +352,8 @@ def lost(s: Scene, within_s: float) -> float:
     agent = s.ls.vehicles[1].agent
     until(s.ls, within_s, lambda: agent.peers.phases()[2] is None)
     wait(s.ls, 0.5)
-    assert "2" not in str([n.vehicle_id for n in agent._neighbours if n.in_formation])
-    (n,) = (n for n in agent._neighbours if n.vehicle_id == 2)
+    assert "2" not in str([n.vehicle_id for n in agent.neighbours if n.in_formation])
+    (n,) = (n for n in agent.neighbours if n.vehicle_id == 2)
     assert n.last_seen_ned_m is not None
     assert not n.shares_avoidance
     return s.ls.now_ns * 1e-9 - s.began_s - 0.5
@@ -380,7 +380,7 @@ def peer_silent() -> tuple[float, float]:
 def not_used(s: Scene, failsafe: Failsafe) -> None:
     assert s.count(failsafe) >= 1
     wait(s.ls, 0.1)
-    places = [n for n in s.ls.vehicles[1].agent._neighbours if n.vehicle_id == 2]
+    places = [n for n in s.ls.vehicles[1].agent.neighbours if n.vehicle_id == 2]
     assert places
     assert not any(n.in_formation or n.shares_avoidance for n in places)
     must_go_on(s, Phase.MOVING)
@@ -437,12 +437,12 @@ def own_id() -> tuple[float, float]:
     s = scene(moving=True)
     wait(s.ls, 1.0)
     s.begin()
-    sent = s.ls.vehicles[1].agent.messages_sent
+    sent = s.ls.vehicles[1].agent.publisher.messages_sent
     for _ in range(20):
         s.ls.inject_peer("fleet/1/state", b"whatever", 1)
         wait(s.ls, 0.05)
     assert s.count(Failsafe.OWN_ID) == 20
-    assert 2 <= s.ls.vehicles[1].agent.messages_sent - sent <= 3
+    assert 2 <= s.ls.vehicles[1].agent.publisher.messages_sent - sent <= 3
     must_go_on(s, Phase.MOVING)
     return s.after(Failsafe.OWN_ID.value), 0.0
 
@@ -605,7 +605,7 @@ def test_an_estimator_that_says_nothing_any_more_counts_as_uncertain() -> None:
 def test_a_position_that_jumps_on_the_ground_is_no_failsafe_in_the_air(when: str) -> None:
     # PX4's estimator resets its position on the ground, seconds before it may be armed.
     ls = Lockstep(fleet(2), seed=8)
-    ls.run_until(10.0, lambda: not any(v.agent.unready(ls.now) for v in ls.vehicles.values()))
+    ls.run_until(10.0, lambda: not any(v.agent.operator.unready(ls.now) for v in ls.vehicles.values()))
     s = Scene(ls, [])
     if when == "armed on the ground":
         ls.command(b'{"verb":"takeoff"}')
@@ -614,7 +614,7 @@ def test_a_position_that_jumps_on_the_ground_is_no_failsafe_in_the_air(when: str
     s.tamper(49)
     s.inject(FaultKind.ESTIMATOR_RESET)
     wait(ls, 0.5)
-    assert s.ls.vehicles[1].agent.supervisor.position_jumps == 1
+    assert s.ls.vehicles[1].agent.supervisor.flight.positions.jumps == 1
     s.tamper()
     if when == "disarmed":
         wait(ls, 2.0)

@@ -27,7 +27,8 @@ from flights import (
 
 from companion.config import FleetConfig
 from companion.core.frames import Ned
-from companion.core.trajectory import VelocityLeg, with_legs
+from companion.core.trajectory.legs import VelocityLeg
+from companion.core.trajectory.successors import with_legs
 from companion.core.values import Instant, Phase
 from companion.errors import RefusedError
 from companion.operator.client import Operator, turn_leg, velocity_leg

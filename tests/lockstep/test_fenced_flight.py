@@ -8,7 +8,9 @@ import pytest
 from flights import fleet, launch, truth, until, until_formed, wait
 
 from companion.core.frames import Ned
-from companion.core.trajectory import FleetTrajectory, GotoLeg, VelocityLeg, with_legs
+from companion.core.trajectory.fleet import FleetTrajectory
+from companion.core.trajectory.legs import GotoLeg, VelocityLeg
+from companion.core.trajectory.successors import with_legs
 from companion.core.values import ZERO, Phase
 from companion.wire.peer import encode_motion
 from sim.lockstep.lockstep import Lockstep

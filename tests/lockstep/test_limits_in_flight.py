@@ -11,10 +11,8 @@ import pytest
 from flights import fleet, parse, until, wait
 
 from companion.core.frames import Ned
-from companion.core.law.starling import Law
 from companion.core.safety.filter import SafetyFilter
-from companion.core.trajectory import Reference
-from companion.core.values import FILTERED_PHASES, Command, Instant, Neighbour, Phase, VehicleState
+from companion.core.values import FILTERED_PHASES, Command, Instant, Neighbour, Phase, SafeSetpoint, VehicleState
 from sim.autopilot.faults import Fault, FaultKind
 from sim.lockstep.lockstep import Lockstep
 
@@ -67,18 +65,18 @@ LIMITS = {
 
 
 @dataclass(slots=True)
-class AskedFor:
-    """A law whose command is replaced by what is asked for."""
+class AskedFor(SafetyFilter):
+    """The real filter, given what is asked for in the place of the command: no law reaches all of it."""
 
-    sound: Law
     limit: Limit | None = None
     asked: float = 0.0
 
-    def command(
-        self, ego: VehicleState, reference: Reference, neighbours: Sequence[Neighbour], *, alone: bool
-    ) -> tuple[Command, Ned]:
-        command, residual = self.sound.command(ego, reference, neighbours, alone=alone)
-        return command if self.limit is None else self.limit.ask(command, ego, self.asked), residual
+    def apply(
+        self, command: Command, ego: VehicleState, neighbours: Sequence[Neighbour], velocity_bias_ned_m_s: Ned,
+        dt_s: float,
+    ) -> SafeSetpoint | None:  # fmt: skip
+        asked = command if self.limit is None else self.limit.ask(command, ego, self.asked)
+        return SafetyFilter.apply(self, asked, ego, neighbours, velocity_bias_ned_m_s, dt_s)
 
 
 class Flown:
@@ -97,15 +95,15 @@ class Flown:
         self.sent: list[tuple[float, Any]] = []
         self.ls = Lockstep(fleet(1, altitude_m=ALTITUDE_M, change=change), seed=3, record=self.record)
         self.agent = self.ls.vehicles[1].agent
-        self.law = self.agent.law = AskedFor(self.agent.law)
-        self.ls.run_until(20.0, lambda: not self.agent.unready(self.ls.now))
+        self.filter = self.agent.safety = AskedFor(self.agent.config.safety_limits)
+        self.ls.run_until(20.0, lambda: not self.agent.operator.unready(self.ls.now))
 
     def record(self, i: int, channel: str, now: Instant, body: bytes) -> None:
         if channel == "output/mavlink" and body[7:10] == b"\x54\x00\x00":
             self.sent.append((now.monotonic_ns * 1e-9, parse(body)))
 
     def asks(self, limit: Limit | None, value: float = 0.0) -> None:
-        self.law.limit, self.law.asked = limit, value
+        self.filter.limit, self.filter.asked = limit, value
 
     def silent(self, seconds: float) -> None:
         """The autopilot sends nothing for a while."""
@@ -136,7 +134,7 @@ def test_what_is_sent_is_within_the_limit_and_nothing_is_sent_disarmed_or_withou
     flown.silent(0.9)
     assert flown.during(0.9) == [], "disarmed, positions stale"
     flown.asks(None)
-    until(flown.ls, 20.0, lambda: not flown.agent.unready(flown.ls.now))
+    until(flown.ls, 20.0, lambda: not flown.agent.operator.unready(flown.ls.now))
     flown.ls.command(b'{"verb":"takeoff"}')
     until(flown.ls, 30.0, lambda: flown.ls.all_in(Phase.WAITING))
     wait(flown.ls, 1.0)

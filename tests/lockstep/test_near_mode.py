@@ -7,10 +7,10 @@ import pytest
 from flights import fleet, launch, until, wait
 
 from companion.config import FleetConfig
-from companion.core.near import NearMode
 from companion.core.safety.filter import COLLISION_DISTANCE_M
+from companion.core.trigger.near import NearMode
 from companion.core.values import Phase
-from companion.vehicle.agent import CAUSES
+from companion.vehicle.publisher import CAUSES
 from sim.lockstep.lockstep import Lockstep
 from sim.lockstep.network import NetworkParameters
 from sim.study import headon, messages
@@ -22,7 +22,7 @@ MEETING = headon.meeting_of(load_config("headon"))
 def counted(ls: Lockstep) -> Counter[str]:
     total: Counter[str] = Counter()
     for v in ls.vehicles.values():
-        total.update(v.agent.sent_because)
+        total.update(v.agent.publisher.sent_because)
     return total
 
 
@@ -90,13 +90,13 @@ def test_two_of_which_one_is_thrown_at_the_other_speak_at_10_hz_until_they_are_a
     ls = two_over_their_pads()
     throw(ls, 1, 2.5)
     wait(ls, 0.3)
-    assert all(v.agent.near.promised for v in ls.vehicles.values()), "both, within 0.3 s"
-    early = {i: v.agent.messages_sent for i, v in ls.vehicles.items()}
+    assert all(v.agent.publisher.near.promised for v in ls.vehicles.values()), "both, within 0.3 s"
+    early = {i: v.agent.publisher.messages_sent for i, v in ls.vehicles.items()}
     wait(ls, 1.0)
     for i, v in ls.vehicles.items():
-        assert 9 <= v.agent.messages_sent - early[i] <= 20, "10 Hz, and what the trigger fires"
+        assert 9 <= v.agent.publisher.messages_sent - early[i] <= 20, "10 Hz, and what the trigger fires"
     wait(ls, 10.0)
-    assert not any(v.agent.near.promised for v in ls.vehicles.values())
+    assert not any(v.agent.publisher.near.promised for v in ls.vehicles.values())
     before = counted(ls)
     wait(ls, 10.0)
     assert counted(ls)["near"] == before["near"]
@@ -107,11 +107,11 @@ def test_two_of_which_one_is_thrown_at_the_other_speak_at_10_hz_until_they_are_a
 def test_one_message_that_arrives_is_enough_for_both_to_speak() -> None:
     """The thrown one hears nothing, and the other learns of it by its messages alone: who is named answers."""
     ls = two_over_their_pads()
-    ls.vehicles[2].agent.near = Deaf(ls.vehicles[2].agent.near.rate)
+    ls.vehicles[2].agent.publisher.near = Deaf(ls.vehicles[2].agent.publisher.near.rate)
     throw(ls, 1, 2.5)
     wait(ls, 0.4)
-    assert ls.vehicles[2].agent.near.promised
-    assert ls.vehicles[2].agent.near.peers(ls.now_ns) == ()
+    assert ls.vehicles[2].agent.publisher.near.promised
+    assert ls.vehicles[2].agent.publisher.near.peers(ls.now_ns) == ()
 
 
 class Deaf(NearMode):

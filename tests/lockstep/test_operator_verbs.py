@@ -22,7 +22,8 @@ from flights import (
     wait,
 )
 
-from companion.core.trajectory import VelocityLeg, with_legs
+from companion.core.trajectory.legs import VelocityLeg
+from companion.core.trajectory.successors import with_legs
 from companion.core.values import ZERO, Instant, Phase
 from companion.operator.client import Operator, velocity_leg
 from companion.vehicle.agent import Agent

@@ -57,7 +57,7 @@ def of_1_18(tables: dict[str, Any]) -> None:
 def test_a_vehicle_on_px4_1_18_takes_off_and_its_sticks_must_end_offboard() -> None:
     ls = Lockstep(fleet(1, change=of_1_18))
     ls.run_until(6.0)
-    assert ls.vehicles[1].agent.unready(ls.now) == []
+    assert ls.vehicles[1].agent.operator.unready(ls.now) == []
     set_parameter(ls, 1, "MAN_OVERRIDE_SPD", -1.0)
     ls.run_until(13.0)
     assert take_off(ls, 1) == "MAN_OVERRIDE_SPD is -1, must be >= 0: a pilot's sticks would not end OFFBOARD"
@@ -70,18 +70,18 @@ def test_a_vehicle_on_px4_1_18_takes_off_and_its_sticks_must_end_offboard() -> N
 def test_a_low_battery_and_a_slow_link_are_named_together() -> None:
     ls = Lockstep(fleet(1))
     ls.run_until(6.0)
-    assert ls.vehicles[1].agent.unready(ls.now) == []
+    assert ls.vehicles[1].agent.operator.unready(ls.now) == []
     ls.vehicles[1].autopilot.inject(Fault(FaultKind.LOW_BATTERY, 0.2))
     ls.run_until(8.0)
     assert take_off(ls, 1) == "battery at 20 %, must have 30 %"
     ls.vehicles[1].autopilot.inject(Fault(FaultKind.SLOW_LINK, 600.0))
     ls.run_until(11.9)
-    reasons = ls.vehicles[1].agent.unready(ls.now)
+    reasons = ls.vehicles[1].agent.operator.unready(ls.now)
     assert "battery at 20 %, must have 30 %" in reasons
     assert "autopilot does not answer TIMESYNC" in reasons
     assert any(r.startswith("no heartbeat for") for r in reasons)
     ls.run_until(14.0)
-    reasons = ls.vehicles[1].agent.unready(ls.now)
+    reasons = ls.vehicles[1].agent.operator.unready(ls.now)
     assert "battery unknown, must have 30 %" in reasons, "what was told more than 5 s ago"
     assert "estimator not ready (flags 0x0, needs 0x17)" in reasons
 
@@ -111,7 +111,7 @@ def test_in_flight_nothing_of_preflight_is_asked() -> None:
     until_formed(ls)
     wait(ls, 5.0)
     assert {kind for s, kind in kinds if s > begin}.isdisjoint({PARAMETER_READ, TIMESYNC})
-    assert ls.vehicles[1].agent.unready(ls.now) == []
+    assert ls.vehicles[1].agent.operator.unready(ls.now) == []
 
 
 @pytest.mark.parametrize("when", ["climbing", "formed"])
@@ -138,9 +138,9 @@ def test_a_companion_that_starts_while_its_vehicle_flies_sends_nothing_that_move
     assert agent.autopilot.armed
     assert {m.get_msgId() for m in sent} <= {HEARTBEAT, COMMAND}
     assert {m.command for m in sent if m.get_msgId() == COMMAND} <= {STREAM_RATES, REQUEST_MESSAGE}
-    assert "armed by somebody else" in agent.unready(ls.now)
+    assert "armed by somebody else" in agent.operator.unready(ls.now)
     assert "armed by somebody else" in (take_off(ls, 1) or "")
-    assert "armed by somebody else" in {c.message for c in agent.checks(ls.now) if not c.passed}
+    assert "armed by somebody else" in {c.message for c in agent.operator.checks(ls.now) if not c.passed}
     # In OFFBOARD the autopilot's own failsafe has landed it by its parameter; AUTO.TAKEOFF goes on without us.
     wanted = {"formed": {Px4Mode.AUTO_LAND}, "climbing": {Px4Mode.AUTO_TAKEOFF, Px4Mode.AUTO_LOITER}}[when]
     assert ls.vehicles[1].autopilot.truth().custom_mode in wanted
@@ -152,7 +152,7 @@ def test_a_companion_that_starts_while_its_vehicle_flies_sends_nothing_that_move
 def test_accounts_of_a_lockstep_fleet_are_of_one_mind() -> None:
     ls = Lockstep(fleet(3))
     ls.run_until(6.0)
-    accounts = [v.agent.account(ls.now) for v in ls.vehicles.values()]
+    accounts = [v.agent.operator.preflight_report(ls.now) for v in ls.vehicles.values()]
     assert len({a.configuration for a in accounts}) == 1
     assert len({a.assignment for a in accounts}) == 1
     assert all(c.passed for a in accounts for c in a.checks)

@@ -14,12 +14,16 @@ from flights import Tape, fleet, launch, straight, until, until_formed, until_la
 
 from companion.config import FleetConfig
 from companion.core.frames import Ned
-from companion.core.trajectory import FleetTrajectory, TrajectoryHistory, VelocityLeg, with_legs
+from companion.core.trajectory.fleet import FleetTrajectory
+from companion.core.trajectory.history import TrajectoryHistory
+from companion.core.trajectory.legs import VelocityLeg
+from companion.core.trajectory.successors import with_legs
 from companion.core.values import Phase
 from companion.wire.peer import encode_motion
 from companion.wire.px4 import Px4Mode
 from sim.autopilot.faults import Fault, FaultKind
-from sim.launch.summary import Flight, summarise
+from sim.launch.summary.flight import Flight
+from sim.launch.summary.summarise import summarise
 from sim.lockstep.lockstep import UTC_AT_START_NS, Lockstep
 
 ON_GROUND = 1

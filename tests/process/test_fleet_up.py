@@ -47,15 +47,16 @@ from fleet_process import (
 from pymavlink.dialects.v20 import development as dialect
 
 from companion.__main__ import main as companion_main
+from companion.core.events import KillCause
 from companion.core.failsafe import Failsafe
 from companion.core.frames import Ned
 from companion.core.values import PeerMessage, PeerSample, Phase
 from companion.io.recorder import read_recording
 from companion.io.replay import replay_file
-from companion.io.zenoh_peers import (
+from companion.io.zenoh.configuration import (
     PLANS_HZ,
     REQUESTS_HZ,
-    PeerNetworkSettings,
+    SessionSettings,
     scouting_port,
     zenoh_configuration,
 )
@@ -136,7 +137,7 @@ class Flown:
 
 def put_garbage(fleet: Fleet) -> None:
     """Peers' payloads that no vehicle may take, through a session of the fleet's own namespace."""
-    settings = PeerNetworkSettings(fleet.config.fleet.name, None, scouting_port=fleet.config.peers.scouting_port)
+    settings = SessionSettings(fleet.config.fleet.name, None, scouting_port=fleet.config.peers.scouting_port)
 
     def state(vehicle_id: int, ahead_s: float = 0.0) -> bytes:
         at_ns = time.time_ns() + round(ahead_s * 1e9)
@@ -357,8 +358,8 @@ class Loss:
 
 @pytest.fixture(scope="module")
 def loss(tmp_path_factory: pytest.TempPathFactory) -> Loss:
-    """Formed and moving; companion 2 dies, companion 3 can write no more, the companions' file is edited, the launcher
-    is interrupted."""
+    """Formed and moving; the companions' server and companion 2 die, companion 3 can write no more, the file is edited,
+    the launcher is interrupted."""
     fleet = make_fleet(tmp_path_factory.mktemp("loss"), 4)
     loss = Loss(fleet)
     out = fleet.folder / "flights"
@@ -367,6 +368,7 @@ def loss(tmp_path_factory: pytest.TempPathFactory) -> Loss:
         wait_status(operator, all_in(fleet.ids, *SETTLED, revision=2))
         loss.folder = flight_folder(out)
         resource.prlimit(child(up.popen.pid, "run --vehicle 3 "), resource.RLIMIT_FSIZE, (0, 0))
+        os.kill(child(up.popen.pid, "companions' server"), signal.SIGKILL)
         os.kill(child(up.popen.pid, "run --vehicle 2 "), signal.SIGKILL)
         loss.killed_ns = time.time_ns()
         with (loss.folder / "fleet.toml").open("a") as file:
@@ -403,7 +405,7 @@ def test_a_lost_companion_fails_the_flight_and_is_named(loss: Loss) -> None:
     assert loss.summary["lost"] == [2]
     assert loss.summary["passed"] is False
     assert "companions lost" in loss.out
-    assert "ended: companion 2" in loss.err
+    assert "ended: companion 2, status -9 (SIGKILL)" in loss.err
     assert loss.summary["exit_status"] == {"1": 0, "2": -signal.SIGKILL, "3": 0, "4": 0}
 
 
@@ -438,6 +440,31 @@ def test_without_a_terminal_progress_is_a_line_now_and_then(loss: Loss) -> None:
     assert "minimum distance" in loss.out
 
 
+# -- the operator kills -----------------------------------------------------------------------------------------------
+
+
+def test_a_fleet_that_its_operator_kills_in_flight_falls_is_shown_as_killed_and_fails(tmp_path: Path) -> None:
+    fleet = make_fleet(tmp_path, 2)
+    out = tmp_path / "flights"
+    arguments = ("sim", "up", "--json", "--fleet", str(fleet.file), "--out", str(out), "--plan", FOR_EVER)
+    with started(*arguments, folder=tmp_path, name="up") as up:
+        with operator_of(fleet) as operator:
+            wait_status(operator, all_in(fleet.ids, "waiting", *SETTLED))
+        killed = run("sim", "kill", "--yes", "--fleet", str(fleet.file), folder=tmp_path)
+        assert killed.returncode == 0, killed.stderr
+        assert up.wait(30.0) == 1
+    summary = json.loads(up.out)
+    assert summary["passed"] is False
+    assert summary["killed"] == {str(i): KillCause.COMMAND.value for i in fleet.ids}
+    assert [c["met"] for c in summary["criteria"] if c["what"] == "vehicles killed"] == [False]
+    (command,) = (c for c in summary["commands"] if c["verb"] == "kill")
+    assert (command["accepted"], command["refused"], command["unanswered"]) == (fleet.ids, {}, [])
+    for i in fleet.ids:
+        track = truth(flight_folder(out) / "truth.bin", i)
+        assert track["armed"][-1] == 0
+        assert track["velocity_ned_m_s"][:, 2].max() > 2.0
+
+
 # -- the launcher itself dies ----------------------------------------------------------------------------------------
 
 
@@ -452,7 +479,7 @@ def test_no_child_outlives_a_launcher_killed_in_flight_and_the_vehicles_are_land
         with operator_of(fleet) as operator:
             wait_status(operator, all_in(fleet.ids, "waiting", "forming"))
         pids = list(children(up.popen.pid).values())
-        assert len(pids) == 2 + len(fleet.ids)
+        assert len(pids) == 3 + len(fleet.ids)
         up.signal(signal.SIGKILL)
         assert eventually(lambda: not still_there(pids), 2.0), still_there(pids)
     assert ports_free(fleet)
@@ -464,7 +491,7 @@ def test_no_child_outlives_a_launcher_killed_in_flight_and_the_vehicles_are_land
 def test_no_child_outlives_a_launcher_killed_while_they_start(tmp_path: Path) -> None:
     fleet = make_fleet(tmp_path, 1)
     with started("sim", "up", "--fleet", str(fleet.file), "--out", str(tmp_path / "o"), folder=tmp_path) as up:
-        assert eventually(lambda: len(children(up.popen.pid)) == 2 + len(fleet.ids))
+        assert eventually(lambda: len(children(up.popen.pid)) == 3 + len(fleet.ids))
         pids = list(children(up.popen.pid).values())
         up.signal(signal.SIGKILL)
         up.wait()

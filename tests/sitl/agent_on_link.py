@@ -55,5 +55,5 @@ class AgentOnLink:
     def run_while(self, condition: Callable[[], bool], at_most_s: float) -> None:
         end_s = time.monotonic() + at_most_s
         while condition():
-            assert time.monotonic() < end_s, (self.agent.unready(self.now), self.notes)
+            assert time.monotonic() < end_s, (self.agent.operator.unready(self.now), self.notes)
             self.run(0.05)

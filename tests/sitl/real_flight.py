@@ -12,7 +12,7 @@ from autopilot_flight import COMPANION_COMPONENT, VELOCITY_AND_YAW, mavlink
 
 from companion.core.frames import Geodetic
 from sim.autopilot.modes import MODE_OF_CUSTOM, Mode
-from sim.launch.sitl import Px4Instance
+from sim.launch.px4_instance import Px4Instance
 
 HOME = Geodetic(47.397742, 8.545594, 488.0)
 COMPANION_PORT, AUTOPILOT_PORT = 14540, 14580
@@ -93,6 +93,14 @@ class RealFlight:
                     assert (message.target_system, message.target_component) == (1, COMPANION_COMPONENT)
                     return int(message.result)
         return None
+
+    def version(self) -> tuple[int, int]:
+        """PX4's, as it tells it."""
+        seen = len(self.received)
+        assert self.command(mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION) == 0
+        self.run(0.5)
+        (told,) = (m for _, m in self.received[seen:] if m.get_type() == "AUTOPILOT_VERSION")
+        return told.flight_sw_version >> 24, told.flight_sw_version >> 16 & 0xFF
 
     def stream_at(self, message_id: int, rate_hz: float) -> None:
         assert self.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, 1e6 / rate_hz) == 0

@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import development as dialect
 from companion.config import FleetConfig, load
 from companion.core.values import Phase
 from companion.wire.px4 import FORCE
-from sim.launch.sitl import FLEET_PARAMETERS, Px4Instance
+from sim.launch.px4_instance import FLEET_PARAMETERS, Px4Instance
 
 DELAYS_S = (0.1, 0.3, 0.6, 0.9, 1.2, 1.6, 2.0)
 ARM = dialect.MAV_CMD_COMPONENT_ARM_DISARM
@@ -46,7 +46,7 @@ def says(armed: bool) -> Any:
 def check_one_disarm(vehicle: AgentOnLink, delay_s: float, port: int = GCS_PORT) -> None:
     """Take-off, arming, disarm after a while: it stays disarmed until it is commanded again."""
     agent = vehicle.agent
-    vehicle.run_while(lambda: bool(agent.unready(vehicle.now)), 60.0)
+    vehicle.run_while(lambda: bool(agent.operator.unready(vehicle.now)), 60.0)
     boot, begun, obeyed = agent.status(vehicle.now).place
     order = {"verb": "takeoff", "id": f"{delay_s}", "issuer": "test", "after": {"1": [[boot, begun, obeyed]]}}
     answer = json.loads(agent.receive_command(json.dumps(order).encode(), vehicle.now))

@@ -16,8 +16,9 @@ from companion.config import FleetConfig, load
 from companion.config.endpoints import autopilot_port, companion_port, serial_endpoint, udp_endpoint
 from companion.config.file import parse
 from companion.config.overrides import plan_legs, resize
+from companion.core.law.starling import StarlingLaw
 from companion.core.safety.fence import Fence
-from companion.core.trajectory import GotoLeg, TurnLeg, VelocityLeg
+from companion.core.trajectory.legs import GotoLeg, TurnLeg, VelocityLeg
 from companion.errors import ConfigError
 
 DEFAULT = Path(__file__).resolve().parents[2] / "fleet.toml"
@@ -135,11 +136,11 @@ RANGES = [
     (f"{VELOCITY}.duration_s", 0, "a finite number > 0 and <= 86400 s"),
     (f"{TURN}.rate_deg_s", 61.0, "a finite number >= -60 and <= 60 deg/s"),
     (f"{TURN}.angle_deg", 5e-324, "a finite number >= 0.01 and <= 36000 deg"),
-    ("law.kind", "boids", "'starling' or 'paper'"),
+    ("law.kind", "boids", "one of starling, paper"),
     ("law.hold", "second", "'damped', 'zero' or 'first'"),
     ("law.k_s", -0.1, "a finite number >= 0 and <= 100"),
     ("law.a_max_m_s2", 1e-9, "a finite number >= 2 and <= 20 m/s^2"),
-    ("trigger.kind", "always", "'error', 'switching' or 'periodic'"),
+    ("trigger.kind", "always", "one of error, switching, periodic"),
     ("trigger.gamma_s2", 0.0, "a finite number >= 0.0001 and <= 100 s^2"),
     ("trigger.near_period_s", 0.049, "a finite number >= 0.05 and <= 0.2 s"),
     ("trigger.near_period_s", 0.21, "a finite number >= 0.05 and <= 0.2 s"),
@@ -556,9 +557,11 @@ def test_what_a_hold_leaves_out_counts_in_a_periods_bound(hold: str) -> None:
 def test_the_papers_law_is_selectable() -> None:
     tables = changed(put("law.kind", "paper"), put("law.hold", "zero"), put("trigger.kind", "switching"))
     config = parse(tables, "fleet.toml")
-    assert config.gains.normalise == 0.0
-    assert config.gains.k_p == 0.0
-    assert config.gains.a_max == 5.0
+    law = config.law.law(config.r0_m)
+    assert isinstance(law, StarlingLaw)
+    assert law.gains.normalise == 0.0
+    assert law.gains.k_p == 0.0
+    assert law.gains.a_max == 5.0
     assert config.safety_radius_m > 0.65
 
 

@@ -17,9 +17,11 @@ from companion.config import load
 from companion.core.counts import OTHER, Counts, RefusalKind
 from companion.core.failsafe import Failsafe
 from companion.core.frames import Ned
-from companion.core.neighbours import COUNTED as SAMPLES_COUNTED
+from companion.core.neighbours.table import COUNTED as SAMPLES_COUNTED
 from companion.core.safety.filter import ACTING
-from companion.core.trajectory import FleetTrajectory, TurnLeg, VelocityLeg, with_formation, with_legs
+from companion.core.trajectory.fleet import FleetTrajectory
+from companion.core.trajectory.legs import TurnLeg, VelocityLeg
+from companion.core.trajectory.successors import with_formation, with_legs
 from companion.core.values import Instant
 from companion.vehicle.agent import REJECTED, Agent
 from companion.vehicle.autopilot.px4 import COUNTED

@@ -17,19 +17,11 @@ from companion.config.overrides import plan_legs
 from companion.core.budget import Bucket, ExaminationBudget
 from companion.core.frames import Ned
 from companion.core.route import LOOKS_MAX
-from companion.core.trajectory import (
-    BLEND_MIN_S,
-    GOTO_MIN_S,
-    FleetTrajectory,
-    GotoLeg,
-    Leg,
-    SlotChange,
-    TrajectoryState,
-    TurnLeg,
-    VelocityLeg,
-    leg_duration_s,
-    with_legs,
-)
+from companion.core.trajectory.fleet import FleetTrajectory, TrajectoryState
+from companion.core.trajectory.goto import GOTO_MIN_S
+from companion.core.trajectory.legs import GotoLeg, Leg, TurnLeg, VelocityLeg, leg_duration_s
+from companion.core.trajectory.slots import BLEND_MIN_S, SlotChange
+from companion.core.trajectory.successors import with_legs
 from companion.core.trajectory_check import (
     DURATION_MAX_S,
     LEGS_MAX,

@@ -90,5 +90,5 @@ def test_what_is_named_is_there(path: Path) -> None:
 def test_a_name_that_is_gone_is_found() -> None:
     assert missing_module("companion.core.no_such_module")
     assert missing_module("core.trajectory.NoSuchClass")
-    assert not missing_module("core.trajectory.FleetTrajectory")
+    assert not missing_module("core.trajectory.fleet.FleetTrajectory")
     assert "no_such_word_anywhere_" + "else" not in words_of_the_code()

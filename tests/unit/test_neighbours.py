@@ -11,22 +11,23 @@ from companion.core.failsafe import Failsafe
 from companion.core.formation import shape_slots
 from companion.core.frames import Ned
 from companion.core.monitor import PeerMotion, unheard_error_m
-from companion.core.near import MISSING_MAX_M, certain_age_s
-from companion.core.neighbours import (
+from companion.core.neighbours.gates import GATE_RESIDUAL_M, GATE_VELOCITY_M_S, is_outlier
+from companion.core.neighbours.sample import PeerLimits, predict_sample
+from companion.core.neighbours.table import (
     FUTURE_LIMIT_S,
-    GATE_RESIDUAL_M,
-    GATE_VELOCITY_M_S,
     PRESENCE_DELAY_S,
     UNCERTAINTY_GROWTH_M_S,
     UNCERTAINTY_GROWTH_MAX_M,
-    PeerLimits,
     PeerTable,
-    is_outlier,
-    predict_sample,
 )
 from companion.core.prediction import HoldKind
 from companion.core.safety.filter import nearest_hypothesis
-from companion.core.trajectory import FleetTrajectory, SlotChange, TrajectoryHistory, TurnLeg, VelocityLeg, with_legs
+from companion.core.trajectory.fleet import FleetTrajectory
+from companion.core.trajectory.history import TrajectoryHistory
+from companion.core.trajectory.legs import TurnLeg, VelocityLeg
+from companion.core.trajectory.slots import SlotChange
+from companion.core.trajectory.successors import with_legs
+from companion.core.trigger.near import MISSING_MAX_M, certain_age_s
 from companion.core.values import Instant, Neighbour, PeerMessage, PeerSample, Phase
 
 PROPERTY = settings(deadline=None, max_examples=60)

@@ -13,15 +13,9 @@ from statuses import FORMED
 
 from companion.config import FleetConfig, load
 from companion.core.frames import Ned
-from companion.core.trajectory import (
-    FleetTrajectory,
-    GotoLeg,
-    TurnLeg,
-    VelocityLeg,
-    over_the_pads,
-    with_formation,
-    with_legs,
-)
+from companion.core.trajectory.fleet import FleetTrajectory
+from companion.core.trajectory.legs import GotoLeg, TurnLeg, VelocityLeg
+from companion.core.trajectory.successors import over_the_pads, with_formation, with_legs
 from companion.errors import ConfigError, RefusedError
 from companion.operator.client import (
     COMMAND_LEAD_NS,

@@ -11,25 +11,21 @@ from hypothesis import strategies as st
 
 from companion.core.formation import shape_slots
 from companion.core.frames import Ned
-from companion.core.trajectory import (
-    BLEND_MIN_S,
+from companion.core.trajectory.fleet import FleetTrajectory
+from companion.core.trajectory.goto import goto_duration_s
+from companion.core.trajectory.history import TrajectoryHistory
+from companion.core.trajectory.legs import (
     PLAN_ACCELERATION_M_S2,
     TURN_RAMP_S,
-    FleetTrajectory,
     GotoLeg,
     Leg,
-    SlotChange,
-    TrajectoryHistory,
     TurnLeg,
     VelocityLeg,
-    assignment_matches,
-    blend_duration_s,
-    goto_duration_s,
     leg_duration_s,
-    minimum_jerk,
-    with_formation,
-    with_legs,
 )
+from companion.core.trajectory.polynomials import minimum_jerk
+from companion.core.trajectory.slots import BLEND_MIN_S, SlotChange, blend_duration_s
+from companion.core.trajectory.successors import assignment_matches, with_formation, with_legs
 
 PROPERTY = settings(deadline=None, max_examples=40)
 START_NS = 1_790_000_000_000_000_000

@@ -46,7 +46,7 @@ class Px4:
         self.asked: list[tuple[float, Any]] = []
 
     def says(self, message: Any, seconds: float) -> bool:
-        return self.client.receive(bytes(message.pack(self.mav)), at(seconds))
+        return self.client.receive(bytes(message.pack(self.mav)), at(seconds)).position
 
     def heartbeat(self, seconds: float, armed: bool = False, mode: int = 0, kind: int = 12, type_: int = 2) -> None:
         self.says(dialect.MAVLink_heartbeat_message(type_, kind, 128 * armed | 1, int(mode), 3, 3), seconds)

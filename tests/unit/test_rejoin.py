@@ -4,7 +4,7 @@ import pytest
 
 from companion.core.frames import Ned
 from companion.core.rejoin import RejoinTrajectory
-from companion.core.trajectory import Reference
+from companion.core.trajectory.fleet import Reference
 
 ZERO = Ned(0.0, 0.0, 0.0)
 SECOND = 1_000_000_000

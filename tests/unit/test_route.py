@@ -13,16 +13,10 @@ from companion.core.formation import shape_slots
 from companion.core.frames import Ned
 from companion.core.route import RESOLUTION_M, first_breach, only_stops
 from companion.core.safety.fence import Fence
-from companion.core.trajectory import (
-    FleetTrajectory,
-    GotoLeg,
-    Leg,
-    SlotChange,
-    TurnLeg,
-    VelocityLeg,
-    with_formation,
-    with_legs,
-)
+from companion.core.trajectory.fleet import FleetTrajectory
+from companion.core.trajectory.legs import GotoLeg, Leg, TurnLeg, VelocityLeg
+from companion.core.trajectory.slots import SlotChange
+from companion.core.trajectory.successors import with_formation, with_legs
 from companion.core.values import ZERO
 
 NEAR_M = 0.25

@@ -271,3 +271,65 @@ def test_setpoints_stream_in_no_phase_on_the_ground_and_in_every_filtered_one() 
             assert one.supervisor.steers
         elif phase not in FLYING_PHASES:
             assert not one.supervisor.steers
+
+
+def jumps(one: Led) -> None:
+    p = one.autopilot.position_ned_m
+    one.autopilot.position_ned_m = Ned(p.north + 2.0, p.east, p.down)
+    one.tick()
+
+
+def test_a_jump_after_a_jump_is_acted_on_without_another_word_but_for_a_new_flight() -> None:
+    one = airborne()
+    jumps(one)
+    jumps(one)
+    assert one.supervisor.counts[Failsafe.POSITION_JUMPED.value] == 2
+    assert one.acted == [Failsafe.POSITION_JUMPED]
+    one.supervisor.release(one.now)
+    one.supervisor.resume(one.now)
+    assert one.run(1.0, lambda: one.phase is Phase.DETACHED)
+    jumps(one)
+    assert one.acted == [Failsafe.POSITION_JUMPED] * 2
+
+
+def test_while_it_does_not_know_where_it_is_nothing_else_is_judged() -> None:
+    one = airborne(fleet(peers={"missing": "land", "wait_s": 6.0}))
+    one.run(5.0)
+    one.autopilot.position_ned_m = one.autopilot.position_ned_m._replace(down=-30.0)
+    jump_count = one.supervisor.position_jumps
+    one.run(1.2, lives=False)
+    one.supervisor.position_came()
+    assert one.supervisor.position_jumps > jump_count
+    one.supervisor.watch(one.now, positioned=False)
+    assert one.acted == []
+    one.tick()
+    assert one.acted == [Failsafe.POSITION_JUMPED]
+
+
+def test_the_fall_of_one_flight_is_none_of_the_next() -> None:
+    one = airborne()
+    one.autopilot.velocity_ned_m_s = Ned(0.0, 0.0, 6.0)
+    one.tick()
+    one.autopilot.armed, one.autopilot.velocity_ned_m_s = False, ZERO
+    one.run(0.5)
+    one.autopilot.on_ground, one.autopilot.mode = True, STABLE
+    assert one.phase is Phase.LANDED
+    one.supervisor.take_off(one.now)
+    one.run(1.0)
+    assert one.supervisor.killed is None
+
+
+def test_a_take_off_that_its_pilot_disarms_leaves_no_take_off_mode_behind() -> None:
+    one = Led()
+    one.tick()
+    one.supervisor.take_off(one.now)
+    assert one.run(1.0, lambda: one.autopilot.mode == TAKE_OFF)
+    one.autopilot.armed = False
+    one.run(0.5)
+    assert one.phase is Phase.IDLE
+    assert one.autopilot.mode == HOLD
+
+
+def test_what_has_happened_is_not_asked_for_again() -> None:
+    one = airborne()
+    assert {Verb.ARM, Verb.TAKE_OFF, Verb.ENGAGE} <= set(one.autopilot.withdrawn)

@@ -7,18 +7,10 @@ import pytest
 
 from companion.core.monitor import PeerMotion, prediction_error_bound_m, unheard_error_m
 from companion.core.prediction import HoldKind, axis, weights
-from companion.core.trigger import (
-    RAISED_MAX_M,
-    ErrorTrigger,
-    PeriodicTrigger,
-    Situation,
-    Spacing,
-    SwitchingTrigger,
-    Trigger,
-    exceeds,
-    switching_exceeds,
-    switching_threshold,
-)
+from companion.core.trigger.base import Situation, Spacing, Trigger
+from companion.core.trigger.error import RAISED_MAX_M, ErrorTrigger, exceeds
+from companion.core.trigger.periodic import PeriodicTrigger
+from companion.core.trigger.switching import SwitchingTrigger, switching_exceeds, switching_threshold
 
 TRIGGER = ErrorTrigger(epsilon_m=0.5, gamma_s2=0.25, kappa=0.5)
 SWITCHING = SwitchingTrigger(gamma_s2=0.5, alpha=0.75, beta=0.5, delta_min=0.25, delta_f=0.0625, eta=0.5)

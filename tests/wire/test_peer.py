@@ -12,16 +12,11 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from companion.core.frames import Ned
-from companion.core.trajectory import (
-    BLEND_MIN_S,
-    GOTO_MIN_S,
-    FleetTrajectory,
-    GotoLeg,
-    Leg,
-    SlotChange,
-    TurnLeg,
-    VelocityLeg,
-)
+from companion.core.law.base import FIELDS_MAX
+from companion.core.trajectory.fleet import FleetTrajectory
+from companion.core.trajectory.goto import GOTO_MIN_S
+from companion.core.trajectory.legs import GotoLeg, Leg, TurnLeg, VelocityLeg
+from companion.core.trajectory.slots import BLEND_MIN_S, SlotChange
 from companion.core.trajectory_check import (
     DURATION_MAX_S,
     MOTION_BYTES_MAX,
@@ -52,7 +47,7 @@ samples = st.builds(PeerSample, bytes_8, times, vectors, vectors, words, st.samp
 near_ids = st.sets(bytes_8, max_size=12).map(lambda ids: tuple(sorted(ids)))
 messages = st.builds(
     PeerMessage, words, words, times, bytes_8, samples, st.lists(samples, max_size=6).map(tuple), near_ids,
-    st.booleans(),
+    st.booleans(), st.lists(singles, max_size=FIELDS_MAX).map(tuple),
 )  # fmt: skip
 
 metres = st.floats(-PLACE_MAX_M, PLACE_MAX_M)
@@ -120,9 +115,23 @@ def test_near_ids_out_of_order_or_twice_are_refused(near: tuple[int, ...]) -> No
 def test_a_flag_that_nobody_knows_is_refused() -> None:
     payload = bytearray(encode_state(MESSAGE))
     assert payload[FLAGS_AT] == 1
-    payload[FLAGS_AT] = 3
+    payload[FLAGS_AT] = 1 | 4
     with pytest.raises(WireError, match="flags"):
         decode_state(bytes(payload))
+
+
+@pytest.mark.parametrize("count", [0, 2, 4, FIELDS_MAX + 1, 255])
+def test_numbers_of_a_law_that_are_not_as_many_as_they_say_are_refused(count: int) -> None:
+    payload = bytearray(encode_state(replace(MESSAGE, told=(1.0, 2.0, 3.0))))
+    payload[-13] = count
+    with pytest.raises(WireError, match="length"):
+        decode_state(bytes(payload))
+
+
+@pytest.mark.parametrize(("number", "kind"), [(nan, "not finite"), (inf, "not finite"), (2e6, "out of range")])
+def test_a_number_of_a_law_that_is_none_is_refused(number: float, kind: str) -> None:
+    with pytest.raises(WireError, match=kind):
+        decode_state(encode_state(replace(MESSAGE, told=(0.0, number))))
 
 
 @given(messages, st.data())

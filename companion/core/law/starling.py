@@ -1,9 +1,12 @@
 """The starling law: separation, alignment and cohesion toward a desired formation.
 
-A `Law` says what a vehicle flies, before the safety filter; a companion holds one and can be given another. The one
-that is flown, `StarlingLaw`, sums over the neighbours with two branch-free scalar functions on plain floats, which a
-swarm study compiles over neighbour lists. With the symbols of the paper (Mei, Duan: "Decentralized Cooperative
-Control of Unmanned Aerial Vehicles Based on Emergent Mechanism of Starlings"), its Eq. (2) reads
+The functions below are the whole of it, on plain numbers and `Neighbour` values: `share` is what one neighbour adds,
+`combine` makes the command of the sum. A companion calls them as they are; a swarm study compiles them
+(`sim.swarm.kernels`). Only `sums_over`, the sum between them, has a compiled form of its own: it is rounded once here
+and after each term there.
+
+With the symbols of the paper (Mei, Duan: "Decentralized Cooperative Control of Unmanned Aerial Vehicles Based on
+Emergent Mechanism of Starlings"), its Eq. (2) reads
 
     u_i = k_s sum_j phi_s(r_ij) r^_ij - k_a sum_j (v_i - v^_j) - k_c sum_j ((p_i - p^_j) - d_ij)
     phi_s(r) = 1/r^2 - 1/r0^2 for r < r0, else 0
@@ -15,38 +18,28 @@ and what is flown by default is
     u_rest = -(k_a/n) sum sat(v_i - v^_j) - (k_c/n) sum sat(p_i - p^_j - d_ij) - k_v (v_i - v_d) + a_d - k_p sat(m_i)
     m_i    = mean over self and neighbours of p^_j - p_ref,j
 
+Velocities are compared as they differ from what the plan asks of each slot: slots that turn or change places have their
+own. Whoever is not in formation is kept apart from; whoever is not known to be at one place is left to the filter.
+
 Deviations from the paper: separation repels (the printed sign attracts) and ends at r0; the sums are divided by the
 number of neighbours n, so that stiffness does not grow with the crowd; errors saturate, so that a far neighbour cannot
 outweigh separation; k_v, a_d and k_p keep the formation moving and in place, where Eq. (2) under held neighbours
-brakes it to a standstill. `Gains` with `normalise = 0`, infinite saturations, `k_v = k_p = 0` is Eq. (2) itself.
+brakes it to a standstill. `Gains` with `normalise = 0`, infinite saturations, `k_v = k_p = 0` is Eq. (2) itself
+(`core.law.paper`).
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import fsum, inf, sqrt
-from typing import NamedTuple, Protocol
+from math import fsum, sqrt
+from typing import NamedTuple
 
 from companion.core.frames import Ned
-from companion.core.trajectory import Reference
-from companion.core.values import Command, Neighbour, VehicleState
+from companion.core.law.base import Wanted
+from companion.core.trajectory.fleet import Reference
+from companion.core.values import Neighbour, VehicleState
 
 DISTANCE_FLOOR_M = 0.2
 """separation grows no further below this distance"""
-
-
-class Law(Protocol):
-    """What a vehicle flies toward its slot and among its neighbours; it keeps no distance by itself."""
-
-    def command(
-        self, ego: VehicleState, reference: Reference, neighbours: Sequence[Neighbour], *, alone: bool
-    ) -> tuple[Command, Ned]:
-        """The wanted command, and the mean residual p_i - p^_j - d_ij to the neighbours in formation (m), which the
-        trigger looks at.
-
-        `ego` is the own state, its velocity free of the estimator's bias; `reference` is what the plan asks of the own
-        slot. A vehicle that flies `alone` is not drawn by the formation.
-        """
-        ...
 
 
 class Gains(NamedTuple):
@@ -72,10 +65,13 @@ class Gains(NamedTuple):
     """norm at which a velocity error saturates (m/s)"""
     normalise: float
     """1: sums are divided by the number of neighbours; 0: they are not (Eq. 2)"""
+    vertical: float = 1.0
+    """1: the law acts along the vertical too; 0: on the level only, distances still in space (altitude is flown by
+    position)"""
 
 
 class Sums(NamedTuple):
-    """What one neighbour adds: (separation, saturated velocity error, saturated position error, position residual)."""
+    """What neighbours add: separation, saturated velocity error, saturated position error, position residual."""
 
     sep_x: float
     sep_y: float
@@ -89,6 +85,8 @@ class Sums(NamedTuple):
     res_x: float
     res_y: float
     res_z: float
+    formed: float
+    """how many of the neighbours are in formation"""
 
 
 def pair(
@@ -106,39 +104,66 @@ def pair(
     ey = dy - oy
     ez = dz - oz
     pos = min(1.0, g.saturation_position / max(sqrt(ex * ex + ey * ey + ez * ez), 1e-12))
-    return Sums(sep * dx, sep * dy, sep * dz, vel * dvx, vel * dvy, vel * dvz, pos * ex, pos * ey, pos * ez, ex, ey, ez)
+    return Sums(
+        sep * dx, sep * dy, sep * dz, vel * dvx, vel * dvy, vel * dvz, pos * ex, pos * ey, pos * ez, ex, ey, ez,
+        1.0,
+    )  # fmt: skip
 
 
-def separation(dx: float, dy: float, dz: float, g: Gains) -> tuple[float, float, float]:
-    """Separation alone, for a neighbour that alignment and cohesion do not heed."""
+def separation(dx: float, dy: float, dz: float, g: Gains) -> Sums:
+    """Separation alone, from a neighbour that alignment and cohesion do not heed."""
     s = pair(dx, dy, dz, 0.0, 0.0, 0.0, dx, dy, dz, g)
-    return s.sep_x, s.sep_y, s.sep_z
+    return Sums(s.sep_x, s.sep_y, s.sep_z, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-def finish(
-    n: float,
-    s: Sums,
-    ex: float, ey: float, ez: float,
-    wx: float, wy: float, wz: float,
-    ax: float, ay: float, az: float,
-    g: Gains,
-) -> tuple[float, float, float]:  # fmt: skip
-    """The command u (m/s^2) from the sums over n neighbours.
+def share(ego: VehicleState, slot_velocity: Ned, n: Neighbour, alone: bool, g: Gains) -> Sums:
+    """What a neighbour adds; `slot_velocity` (m/s) is what the plan asks of the own slot, v_d."""
+    p, q = ego.position_ned_m, n.position_ned_m
+    dx, dy, dz = p.north - q.north, p.east - q.east, p.down - q.down
+    if n.in_formation and not alone:
+        v, w, s, d = ego.velocity_ned_m_s, n.velocity_ned_m_s, n.reference_velocity_ned_m_s, n.offset_ned_m
+        return pair(
+            dx, dy, dz,
+            v.north - w.north - (slot_velocity.north - s.north),
+            v.east - w.east - (slot_velocity.east - s.east),
+            g.vertical * (v.down - w.down - (slot_velocity.down - s.down)),
+            d.north, d.east, d.down if g.vertical > 0.0 else dz, g,
+        )  # fmt: skip
+    if n.last_seen_ned_m is None:
+        return separation(dx, dy, dz, g)
+    return NO_SUMS
 
-    (ex, ey, ez) = p_i - p_ref,i (m), (wx, wy, wz) = v_i - v_d (m/s), (ax, ay, az) = a_d (m/s^2). Since the residual to
-    j is (p_i - p_ref,i) - (p^_j - p_ref,j), the mean m_i over self and neighbours is e_i - sum(residuals)/(n + 1).
+
+def sums_over(ego: VehicleState, slot_velocity: Ned, neighbours: Sequence[Neighbour], alone: bool, g: Gains) -> Sums:
+    """The sums over the neighbours."""
+    return total([share(ego, slot_velocity, n, alone, g) for n in neighbours])
+
+
+def combine(s: Sums, ego: VehicleState, reference: Reference, g: Gains) -> tuple[float, float, float]:
+    """The command u (m/s^2) from the sums.
+
+    Since the residual to j is (p_i - p_ref,i) - (p^_j - p_ref,j), the mean m_i over self and neighbours is
+    e_i - sum(residuals)/(n + 1), with e_i = p_i - p_ref,i.
     """
-    divisor = max(g.normalise * n, 1.0)
-    mx = ex - s.res_x / (n + 1.0)
-    my = ey - s.res_y / (n + 1.0)
-    mz = ez - s.res_z / (n + 1.0)
+    p, v = ego.position_ned_m, ego.velocity_ned_m_s
+    r, rv, ra = reference.position_ned_m, reference.velocity_ned_m_s, reference.acceleration_ned_m_s2
+    divisor = max(g.normalise * s.formed, 1.0)
+    mx = p.north - r.north - s.res_x / (s.formed + 1.0)
+    my = p.east - r.east - s.res_y / (s.formed + 1.0)
+    mz = g.vertical * (p.down - r.down) - s.res_z / (s.formed + 1.0)
     k_p = g.k_p * min(1.0, g.saturation_position / max(sqrt(mx * mx + my * my + mz * mz), 1e-12))
     k_a = g.k_a / divisor
     k_c = g.k_c / divisor
-    bx = ax - k_a * s.vel_x - k_c * s.pos_x - g.k_v * wx - k_p * mx
-    by = ay - k_a * s.vel_y - k_c * s.pos_y - g.k_v * wy - k_p * my
-    bz = az - k_a * s.vel_z - k_c * s.pos_z - g.k_v * wz - k_p * mz
-    return within_budget(s.sep_x, s.sep_y, s.sep_z, bx, by, bz, g.a_max)
+    bx = ra.north - k_a * s.vel_x - k_c * s.pos_x - g.k_v * (v.north - rv.north) - k_p * mx
+    by = ra.east - k_a * s.vel_y - k_c * s.pos_y - g.k_v * (v.east - rv.east) - k_p * my
+    bz = g.vertical * (ra.down - g.k_v * (v.down - rv.down)) - k_a * s.vel_z - k_c * s.pos_z - k_p * mz
+    return within_budget(s.sep_x, s.sep_y, g.vertical * s.sep_z, bx, by, bz, g.a_max)
+
+
+def mean_residual(s: Sums) -> Ned:
+    """Mean of p_i - p^_j - d_ij over the neighbours in formation (m)."""
+    each = 1.0 / max(s.formed, 1.0)
+    return Ned(each * s.res_x, each * s.res_y, each * s.res_z)
 
 
 def within_budget(
@@ -160,56 +185,36 @@ def _share(ab: float, bb: float, aa: float, a_max: float) -> float:
     return max(0.0, min(1.0, (root - ab) / bb))
 
 
-NO_SUMS = Sums(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+NO_SUMS = Sums(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def total(shares: Sequence[Sums]) -> Sums:
-    """The sums over the neighbours, rounded once: the neighbours' order is of no matter."""
+    """The sums of the shares, rounded once: their order is of no matter."""
     return Sums(*map(fsum, zip(*shares, strict=True))) if shares else NO_SUMS
-
-
-def paper_gains(k_s: float, k_a: float, k_c: float, r0: float) -> Gains:
-    """Eq. (2) as printed, with the repulsive sign: plain sums, no saturation, no plan, no limit."""
-    return Gains(k_s, k_a, k_c, 0.0, 0.0, r0, inf, inf, inf, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
 class StarlingLaw:
-    """The law that is flown; with `paper_gains` Eq. (2) of the paper."""
+    """The law that is flown; with the gains of `core.law.paper` Eq. (2) of the paper."""
 
     gains: Gains
 
     def command(
         self, ego: VehicleState, reference: Reference, neighbours: Sequence[Neighbour], *, alone: bool
-    ) -> tuple[Command, Ned]:
-        """See `Law`.
+    ) -> Wanted:
+        """See `Law`."""
+        g = self.gains
+        sums = sums_over(ego, reference.velocity_ned_m_s, neighbours, alone, g)
+        return Wanted(Ned(*combine(sums, ego, reference, g)), mean_residual(sums))
 
-        Altitude is flown by position, so the vertical errors are left out of the horizontal budget. Velocities are
-        compared as they differ from what the plan asks of each slot: slots that turn or change places have their own.
-        Whoever is not in formation, or is not known to be at one place, is kept apart from or left to the filter.
-        """
-        p, v, g = ego.position_ned_m, ego.velocity_ned_m_s, self.gains
-        r, rv, ra, yaw = reference
-        shares = []
-        apart = (0.0, 0.0)
-        for n in neighbours:
-            q, w, d = n.position_ned_m, n.velocity_ned_m_s, n.offset_ned_m
-            dx, dy, dz = p.north - q.north, p.east - q.east, p.down - q.down
-            if n.in_formation and not alone:
-                s = n.reference_velocity_ned_m_s
-                dvx, dvy = v.north - w.north - (rv.north - s.north), v.east - w.east - (rv.east - s.east)
-                shares.append(pair(dx, dy, dz, dvx, dvy, 0.0, d.north, d.east, dz, g))
-            elif n.last_seen_ned_m is None:
-                away = separation(dx, dy, dz, g)
-                apart = (apart[0] + away[0], apart[1] + away[1])
-        sums, count = total(shares), len(shares)
-        sums = sums._replace(sep_x=sums.sep_x + apart[0], sep_y=sums.sep_y + apart[1], sep_z=0.0)
-        u = finish(
-            count, sums,
-            p.north - r.north, p.east - r.east, 0.0,
-            v.north - rv.north, v.east - rv.east, 0.0,
-            ra.north, ra.east, 0.0,
-            g,
-        )  # fmt: skip
-        share = 1.0 / count if count else 0.0
-        return Command(Ned(*u), r, rv, ra, yaw), Ned(sums.res_x * share, sums.res_y * share, 0.0)
+    def reset(self) -> None:
+        """Nothing is kept."""
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """None."""
+        return ()
+
+    def tell(self) -> tuple[float, ...]:
+        """Nothing."""
+        return ()

@@ -136,14 +136,10 @@ def half_plane(ego: VehicleState, shared_acceleration: Ned, neighbour: Neighbour
         vx, vy, vz = _across_segment(q, neighbour, vx, vy, vz)
     d = safety_radius_m(neighbour.uncertainty_m)
     s, t = shared_acceleration, neighbour.reference_acceleration_ned_m_s2
-    return HalfPlane(
-        *barrier(
-            x, y, z, vx, vy, vz, d, neighbour.shares_avoidance, 0.5 * (s.north + t.north), 0.5 * (s.east + t.east)
-        ),
-        neighbour.vehicle_id,
-        v.north,
-        v.east,
+    g_north, g_east, b = barrier(
+        x, y, z, vx, vy, vz, d, neighbour.shares_avoidance, 0.5 * (s.north + t.north), 0.5 * (s.east + t.east)
     )
+    return HalfPlane(g_north, g_east, b, neighbour.vehicle_id, v.north, v.east)
 
 
 def _across_segment(position: Ned, neighbour: Neighbour, vx: float, vy: float, vz: float) -> tuple[float, float, float]:
@@ -206,7 +202,7 @@ def out_of_reach(ego: VehicleState, shared_acceleration: Ned, neighbour: Neighbo
 
 def resting_push_m_s2(distance_m: float, radius_m: float) -> float:
     """`push_m_s2` of a pair that rests at a level distance and shares the avoidance, with its safety radius (m/s^2)."""
-    return push_m_s2(HalfPlane(*barrier(distance_m, 0.0, 0.0, 0.0, 0.0, 0.0, radius_m, True, 0.0, 0.0), 0))
+    return push_m_s2(HalfPlane(*barrier(distance_m, 0.0, 0.0, 0.0, 0.0, 0.0, radius_m, True, 0.0, 0.0)))
 
 
 def push_m_s2(plane: HalfPlane) -> float:

@@ -46,6 +46,18 @@ class Verb(Enum):
     KILL = "kill"
 
 
+class Heard(NamedTuple):
+    """What one datagram brought."""
+
+    autopilot: bool
+    """a sign of life or a position: what proves that it is our own autopilot that speaks"""
+    position: bool
+    """a position newer than the one before"""
+
+
+NOTHING = Heard(autopilot=False, position=False)
+
+
 class Outcome(NamedTuple):
     """What came of a request that the autopilot has not refused."""
 
@@ -111,13 +123,11 @@ class AutopilotPort(Protocol):
 
     events: list[Event]
     """what happened; emptied by whoever has read it"""
-    heard: int
-    """messages so far that prove that it is our own autopilot that speaks"""
 
     # -- bytes ---------------------------------------------------------------------------------------------------------
 
-    def receive(self, datagram: bytes, now: Instant) -> bool:
-        """Take what came on the link; True if it brought a new position. Never raises for what others send."""
+    def receive(self, datagram: bytes, now: Instant) -> Heard:
+        """Take what came on the link; returns what it brought. Never raises for what others send."""
 
     def due(self, now: Instant) -> list[bytes]:
         """What to send now."""

@@ -24,6 +24,7 @@ from companion.vehicle.autopilot.port import (
     AutopilotFacts,
     Estimate,
     FlightMode,
+    Heard,
     Outcome,
     Verb,
 )
@@ -78,7 +79,6 @@ class Px4Autopilot:
         self.codec = MavlinkCodec(vehicle.system_id)
         self.counts = Counts(COUNTED)
         self.events: list[Event] = []
-        self.heard = 0
         self.requests = Requests(self.codec.command, self.counts, self.events)
         self.parameters = ParameterReader(PARAMETERS, same_setting)
         self.armed = False
@@ -115,10 +115,10 @@ class Px4Autopilot:
 
     # -- what it says --------------------------------------------------------------------------------------------------
 
-    def receive(self, datagram: bytes, now: Instant) -> bool:
-        """Take a datagram; True if it brought a position."""
+    def receive(self, datagram: bytes, now: Instant) -> Heard:
+        """Take a datagram; returns what it brought."""
         self.requests.now_ns = now.monotonic_ns
-        fresh = False
+        ours = fresh = False
         foreign = self.codec.foreign_heard
         messages = self.codec.decode(datagram)
         if self.codec.foreign_heard > foreign:
@@ -126,10 +126,10 @@ class Px4Autopilot:
         for message in messages:
             match message:
                 case wire.LocalPosition():
-                    self.heard += 1
+                    ours = True
                     fresh = self._position(message, now) or fresh
                 case wire.Heartbeat():
-                    self.heard += 1
+                    ours = True
                     self._heartbeat(message, now)
                 case wire.CurrentMode():
                     self.custom_mode = message.custom_mode
@@ -156,7 +156,7 @@ class Px4Autopilot:
                     self._clock_ahead_ns.append(message.unix_us * 1000 - now.fleet_ns)
                 case wire.CommandAnswer():
                     self.requests.answered(message, now.monotonic_ns)
-        return fresh
+        return Heard(ours, fresh)
 
     def _heartbeat(self, message: wire.Heartbeat, now: Instant) -> None:
         first = self.heartbeat_ns is None

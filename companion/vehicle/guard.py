@@ -1,4 +1,4 @@
-"""The border between the process and the agent: what raises in the handling of an input ends no flight.
+"""The guard between the process and the agent: what raises in the handling of an input ends no flight.
 
 Nothing that others send should raise, and in lockstep, where agents are called directly, it does: tests see our bugs.
 In a process (and in the replay of its recording, which meets the same inputs) every input passes here. What raises is
@@ -19,7 +19,9 @@ from typing import TypeVar
 
 from companion.core.failsafe import Failsafe
 from companion.core.values import Instant
-from companion.vehicle.agent import Agent, Outputs
+from companion.vehicle.agent import Agent
+from companion.vehicle.autopilot.port import NOTHING, Heard
+from companion.vehicle.outputs import Outputs
 from companion.wire.operator import Answer, encode
 
 T = TypeVar("T")
@@ -28,7 +30,7 @@ RETRY_NS = 5_000_000
 """a tick that raised is tried again no sooner"""
 
 
-class Border:
+class Guard:
     """An agent's inputs, none of which raises."""
 
     def __init__(self, agent: Agent) -> None:
@@ -44,10 +46,10 @@ class Border:
         try:
             return handle()
         except Exception as error:  # noqa: BLE001 - the one place that catches whatever comes
-            self._tell(kind, error)
+            self._count(kind, error)
             return otherwise
 
-    def _tell(self, kind: str, error: Exception) -> None:
+    def _count(self, kind: str, error: Exception) -> None:
         """Count what was raised, and note the first of its kind with the place."""
         name = f"{kind}: {type(error).__name__}"
         self.raised[name] += 1
@@ -55,9 +57,9 @@ class Border:
             place = extract_tb(error.__traceback__)[-1]
             self.notes.append(f"{name} in {Path(place.filename).name}:{place.lineno}, flown on: {error!s:.100}")
 
-    def receive_mavlink(self, datagram: bytes, now: Instant) -> bool:
+    def receive_mavlink(self, datagram: bytes, now: Instant) -> Heard:
         """`Agent.receive_mavlink`."""
-        return self._guarded("mavlink", lambda: self.agent.receive_mavlink(datagram, now), False)
+        return self._guarded("mavlink", lambda: self.agent.receive_mavlink(datagram, now), NOTHING)
 
     def receive_peer(self, key: str, payload: bytes, now: Instant) -> None:
         """`Agent.receive_peer`."""
@@ -86,7 +88,7 @@ class Border:
         try:
             return answer()
         except Exception as error:  # noqa: BLE001 - the one place that catches whatever comes
-            self._tell(kind, error)
+            self._count(kind, error)
             return None
 
     def next_deadline_ns(self) -> int:
@@ -98,7 +100,7 @@ class Border:
         try:
             out = self.agent.advance(now)
         except Exception as error:  # noqa: BLE001 - the one place that catches whatever comes
-            self._tell("advance", error)
+            self._count("advance", error)
             self._retry_ns = now.monotonic_ns + RETRY_NS
             if self._failing_since_ns is None:
                 self._failing_since_ns = now.monotonic_ns

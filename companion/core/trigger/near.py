@@ -25,7 +25,8 @@ from math import hypot
 from companion.core.frames import Ned
 from companion.core.monitor import PeerMotion, unheard_error_m
 from companion.core.safety.filter import DOWNWASH_RATIO, resting_push_m_s2
-from companion.core.trigger import PeriodicTrigger, Situation
+from companion.core.trigger.base import Situation
+from companion.core.trigger.periodic import PeriodicTrigger
 from companion.core.values import Neighbour
 
 PUSH_M_S2 = 2.0

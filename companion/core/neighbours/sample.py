@@ -1,0 +1,96 @@
+"""What one sample says about another time: senders and receivers call the same function, so they agree."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from companion.core.frames import Ned
+from companion.core.monitor import PeerMotion
+from companion.core.prediction import HoldKind, axis, weights
+from companion.core.trajectory.fleet import Reference
+from companion.core.trajectory.history import TrajectoryHistory
+from companion.core.values import AIRBORNE_PHASES, FORMATION_PHASES, ZERO, PeerSample, Phase
+
+VERTICAL_DAMPING_S = 2.0
+FREE_DAMPING_S = 2.0
+"""time in which the velocity of a vehicle fades that follows no plan that we know: the pilot's, or one apart"""
+ALOFT_M = 2.0
+"""above the fleet's origin; a vehicle that is idle higher than this was found in the air by a companion that started"""
+
+
+@dataclass(frozen=True, slots=True)
+class PeerLimits:
+    """What the table needs to know of the configuration."""
+
+    hold: HoldKind
+    hold_damping_s: float
+    range_m: float
+    stale_after_s: float
+    """a peer silent for longer is stale: beyond T_max with its jitter"""
+    heartbeat_s: float
+    """T_max: every peer speaks at least so often"""
+    isolated_flight_s: float
+    """how long a vehicle that hears nobody flies on before it holds by itself"""
+    uncertainty_m: float
+    """bound on the prediction's error of a peer that is heard"""
+    motion: PeerMotion
+    """what a peer can do unseen"""
+    digest_size: int
+
+
+def predict_sample(
+    sample: PeerSample, reference_then: tuple[Ned, Ned], reference: Reference, fleet_ns: int, limits: PeerLimits
+) -> tuple[Ned, Ned]:
+    """Position and velocity at `fleet_ns` as a sample foretells them: what receivers use and senders compare with.
+
+    `reference_then` is p_ref and v_d of the sender's slot at the sample's time, `reference` the one at `fleet_ns`. A
+    vehicle in formation is held by the configured hold. One that climbs or lands stays over its spot, and its vertical
+    speed fades, since it ends at its altitude or on the ground; the velocity of one that flies by itself, or under
+    somebody else, fades too. Whoever has landed or waits to be armed stands.
+    """
+    tau_s = max(0.0, (fleet_ns - sample.time_ns) * 1e-9)
+    p, v = sample.position_ned_m, sample.velocity_ned_m_s
+    if sample.phase in FORMATION_PHASES:
+        w = weights(limits.hold, tau_s, limits.hold_damping_s)
+        then_p, then_v = reference_then
+        now_p, now_v = reference.position_ned_m, reference.velocity_ned_m_s
+        x, vx = axis(p.north, v.north, then_p.north, then_v.north, now_p.north, now_v.north, w)
+        y, vy = axis(p.east, v.east, then_p.east, then_v.east, now_p.east, now_v.east, w)
+        z, vz = axis(p.down, v.down, then_p.down, then_v.down, now_p.down, now_v.down, w)
+        return Ned(x, y, z), Ned(vx, vy, vz)
+    if sample.phase in (Phase.ARMED, Phase.CLIMBING, Phase.LANDING):
+        w = weights("damped", tau_s, VERTICAL_DAMPING_S)
+        return Ned(p.north, p.east, p.down + w.position * v.down), Ned(0.0, 0.0, w.velocity * v.down)
+    if sample.phase in (Phase.DETACHED, Phase.RELEASED, Phase.IDLE):
+        # IDLE too: a companion that starts in flight does not steer.
+        w = weights("damped", tau_s, FREE_DAMPING_S)
+        k, f = w.position, w.velocity
+        return Ned(p.north + k * v.north, p.east + k * v.east, p.down + k * v.down), Ned(*(f * x for x in v))
+    return p, ZERO
+
+
+def aloft(sample: PeerSample) -> bool:
+    """Whether a vehicle that says nothing more after this cannot be taken to stand where it was."""
+    found_in_the_air = sample.phase in (Phase.IDLE, Phase.PREFLIGHT) and sample.position_ned_m.down < -ALOFT_M
+    return sample.phase in AIRBORNE_PHASES or found_in_the_air
+
+
+def stands(sample: PeerSample) -> bool:
+    """Whether it is on the ground, as far as is known."""
+    return sample.phase is Phase.ARMED or not aloft(sample)
+
+
+class Foresight(NamedTuple):
+    """What samples foretell under the plan that this vehicle knows."""
+
+    history: TrajectoryHistory
+    limits: PeerLimits
+
+    def reference_then(self, sample: PeerSample) -> tuple[Ned, Ned]:
+        """p_ref and v_d of the sender's slot at the sample's time."""
+        reference = self.history.reference(sample.vehicle_id, sample.time_ns)
+        return reference.position_ned_m, reference.velocity_ned_m_s
+
+    def at(self, sample: PeerSample, reference_then: tuple[Ned, Ned], fleet_ns: int) -> tuple[Ned, Ned]:
+        """Position and velocity at a time."""
+        reference = self.history.reference(sample.vehicle_id, fleet_ns)
+        return predict_sample(sample, reference_then, reference, fleet_ns, self.limits)

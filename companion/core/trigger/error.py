@@ -1,0 +1,45 @@
+"""The default trigger: Eq. (4) of the paper with a fixed threshold, raised a little by the formation's residual.
+
+send when |e_p|^2 + gamma |e_v|^2 >= epsilon^2 + min(kappa |residual|, 0.1 m)^2
+"""
+
+from math import hypot
+from typing import NamedTuple
+
+from companion.core.monitor import PeerMotion, prediction_error_bound_m
+from companion.core.trigger.base import Situation
+
+RAISED_MAX_M = 0.1
+"""the most by which residuals raise the threshold: those of metres would blind the barrier"""
+
+
+class ErrorTrigger(NamedTuple):
+    """Parameters of the default trigger."""
+
+    epsilon_m: float
+    gamma_s2: float
+    kappa: float
+
+    def fires(self, now: Situation) -> bool:
+        """Eq. (4) with the threshold epsilon, raised by the residual."""
+        return exceeds(now.error_position_2, now.error_velocity_2, now.mean_residual_2, self)
+
+    def error_bound_m(self, motion: PeerMotion) -> float:
+        """The raised threshold, and what the latency adds."""
+        return prediction_error_bound_m(hypot(self.epsilon_m, RAISED_MAX_M), self.gamma_s2, motion)
+
+    @property
+    def waits(self) -> bool:
+        """True: noise may fire twice in a row."""
+        return True
+
+    @property
+    def cause(self) -> str:
+        """Its threshold."""
+        return f"$.trigger.epsilon_m = {self.epsilon_m:g} m"
+
+
+def exceeds(error_position_2: float, error_velocity_2: float, mean_residual_2: float, t: ErrorTrigger) -> bool:
+    """Whether the squared errors (m^2, m^2/s^2) reach the threshold; the squared mean residual (m^2) raises it."""
+    raised_2 = min(t.kappa * t.kappa * mean_residual_2, RAISED_MAX_M * RAISED_MAX_M)
+    return error_position_2 + t.gamma_s2 * error_velocity_2 >= t.epsilon_m * t.epsilon_m + raised_2

@@ -1,0 +1,1 @@
+"""A law and a trigger for starling-fleet, as an example."""
