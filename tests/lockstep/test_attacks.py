@@ -59,7 +59,7 @@ def test_a_second_companion_on_anothers_line_knows_no_position_and_speaks_under_
     twin = ls.add_twin(3, line_of=1)
     ls.run_until(8.0)
     assert twin.autopilot.position_ns is None
-    assert twin.link.foreign_system_id == ls.vehicles[1].agent.vehicle.system_id
+    assert twin.autopilot.facts(ls.now).foreign_system_id == ls.vehicles[1].agent.vehicle.system_id
     ls.remove_twin(3)
     ls.remove_twin(3)
     ls.run_until(9.0)
