@@ -146,8 +146,8 @@ def microseconds(client: str, seconds: float) -> tuple[float, float]:
         wait_until_bound(vehicle.autopilot_port)
         arguments = ["--client", client, "--port", str(vehicle.companion_port), "--seconds", str(seconds)]
         done = subprocess.run(
-            [sys.executable, "-m", "tests.bench.link", *arguments], cwd=HERE, check=True, capture_output=True, text=True,
-            timeout=seconds + WARM_UP_S + 60.0,
+            [sys.executable, "-m", "tests.bench.link", *arguments], cwd=HERE, check=True, capture_output=True,
+            text=True, timeout=seconds + WARM_UP_S + 60.0,
         )  # fmt: skip
     told = json.loads([line for line in done.stdout.splitlines() if line.startswith("{")][-1])
     return 1e6 * told["cpu_s"] / told["positions"], told["positions"] / seconds

@@ -119,7 +119,11 @@ def met_by(tree: Path, tape: Path) -> Met:
     """The same in a process that imports the companion of a tree."""
     environment = {**os.environ, "PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"}
     done = subprocess.run(
-        [sys.executable, __file__, "--meet", str(tape)], cwd=tree, env=environment, capture_output=True, check=True
+        [sys.executable, "-P", __file__, "--meet", str(tape)],
+        cwd=tree,
+        env=environment,
+        stdout=subprocess.PIPE,
+        check=True,
     )
     return Met(*pickle.loads(done.stdout))
 

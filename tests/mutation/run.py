@@ -29,7 +29,7 @@ _PROGRAM, _SAFETY, _FENCE, _NEAR = (f"tests/unit/test_{x}.py" for x in ("program
 SOURCES = {
     "companion/core/safety/filter.py": (_SAFETY, _FENCE, _PROGRAM),
     "companion/core/safety/program.py": (_PROGRAM, _SAFETY, _FENCE),
-    "companion/core/near.py": (_NEAR,),
+    "companion/core/trigger/near.py": (_NEAR,),
     "companion/core/phase.py": ("tests/unit/test_phase.py",),
 }
 """what is changed, and the tests of which one must fail then, the likeliest first"""

@@ -296,10 +296,10 @@ def test_while_it_does_not_know_where_it_is_nothing_else_is_judged() -> None:
     one = airborne(fleet(peers={"missing": "land", "wait_s": 6.0}))
     one.run(5.0)
     one.autopilot.position_ned_m = one.autopilot.position_ned_m._replace(down=-30.0)
-    jump_count = one.supervisor.position_jumps
+    jump_count = one.supervisor.flight.positions.jumps
     one.run(1.2, lives=False)
     one.supervisor.position_came()
-    assert one.supervisor.position_jumps > jump_count
+    assert one.supervisor.flight.positions.jumps > jump_count
     one.supervisor.watch(one.now, positioned=False)
     assert one.acted == []
     one.tick()

@@ -15,12 +15,14 @@ from companion.vehicle.agent import Agent
 from companion.vehicle.autopilot.port import (
     HOLD,
     LAND,
+    NOTHING,
     OFFBOARD,
     TAKE_OFF,
     AutopilotFacts,
     AutopilotPort,
     Estimate,
     FlightMode,
+    Heard,
     Outcome,
     Verb,
 )
@@ -57,7 +59,6 @@ class ToyAutopilot:
 
     obedient: bool = True
     events: list[Event] = field(default_factory=list)
-    heard: int = 0
     heartbeat_ns: int | None = None
     armed: bool = False
     mode: FlightMode = STABLE
@@ -85,8 +86,8 @@ class ToyAutopilot:
     def mode_name(self) -> str:
         return self.mode.name.upper()
 
-    def receive(self, datagram: bytes, now: Instant) -> bool:
-        return False
+    def receive(self, datagram: bytes, now: Instant) -> Heard:
+        return NOTHING
 
     def due(self, now: Instant) -> list[bytes]:
         return []

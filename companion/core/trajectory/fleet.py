@@ -27,6 +27,8 @@ from companion.core.trajectory.polynomials import minimum_jerk
 from companion.core.trajectory.slots import SlotChange
 from companion.core.values import ZERO
 
+REVISIONS = 1 << 32
+"""a trajectory's revision is below this, as it travels"""
 PADS = "pads"
 """name of the formation in which each vehicle is over its own pad"""
 Then = Literal["stay", "land", "return"]
