@@ -341,9 +341,9 @@ def test_hold_brings_the_formation_to_rest(operated: Operated) -> None:
 def test_status_tells_of_every_vehicle_where_it_is_in_the_flight(operated: Operated) -> None:
     for i, told in operated.status.items():
         assert told is not None
-        assert (told["vehicle"], told["phase"], told["mode"], told["shape"]) == (i, "holding", "OFFBOARD", "line")
-        assert told["neighbours"] == 3
-        assert told["ready"] == []
+        assert (told.vehicle, told.phase, told.mode, told.shape) == (i, "holding", "OFFBOARD", "line")
+        assert told.neighbours == 3
+        assert told.ready == []
 
 
 def test_a_motion_faster_than_the_limits_is_refused_by_every_vehicle(operated: Operated) -> None:

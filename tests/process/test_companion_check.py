@@ -30,16 +30,16 @@ def test_a_computer_is_looked_over_with_its_autopilot_and_its_peers(tmp_path: Pa
         done = run(*check, "1", "--seconds", "8", folder=tmp_path)
         busy = run(*check, "2", "--seconds", "1", folder=tmp_path)
     rows = rows_of(done.stdout)
-    faults = {name for name, row in rows.items() if not row["met"]}
+    faults = {name for name, row in rows.items() if not row["passed"]}
     assert faults <= {"system clock"}, done.stdout
     assert done.returncode == (1 if faults else 0)
     assert set(PARAMETERS) - {"MAN_OVERRIDE_SPD"} <= set(rows)  # which this version of the stub has not
     assert rows["bytes"]["value"] > 1000
     assert rows["peers seen"]["value"] == "2"
-    assert rows["zenoh session"]["met"]
+    assert rows["zenoh session"]["passed"]
     assert rows["disk speed"]["value"] > 0
     assert busy.returncode == 1
-    assert "it is in use (is a companion running?)" in rows_of(busy.stdout)["link"]["says"]
+    assert "it is in use (is a companion running?)" in rows_of(busy.stdout)["link"]["message"]
 
 
 def test_without_an_autopilot_the_rows_say_what_is_missing(tmp_path: Path) -> None:

@@ -414,15 +414,15 @@ def test_ctrl_c_lands_the_fleet_and_still_writes_the_summary(loss: Loss) -> None
 
 
 def test_a_companion_that_can_write_no_more_flies_on(loss: Loss) -> None:
-    assert loss.others[3]["recorder_lost"] > 0
-    assert loss.others[3]["phase"] in SETTLED
+    assert loss.others[3].recorder_lost > 0
+    assert loss.others[3].phase in SETTLED
     assert {i: rejected(s, Failsafe.DISK_FULL.value) for i, s in loss.others.items()} == {1: 0, 3: 1, 4: 0}
 
 
 def test_a_file_edited_in_flight_is_noted_once_and_changes_nothing(loss: Loss) -> None:
     for i in (1, 3, 4):
         assert rejected(loss.others[i], EDITED) == 1
-        assert loss.others[i]["phase"] in SETTLED
+        assert loss.others[i].phase in SETTLED
         notes = read_recording(loss.folder / f"vehicle-{i}.mcap").entries
         told = [e.body for e in notes if e.channel == "note" and EDITED.encode() in e.body]
         assert len(told) == (i != 3), "vehicle 3 can write no more"
@@ -619,9 +619,9 @@ def test_a_companion_restarted_in_flight_gets_the_plan_and_leaves_its_vehicle_to
     single: Single,
 ) -> None:
     third = single.restarted[3]
-    assert third["phase"] == "idle"
-    assert third["revision"] == 2
-    assert third["setpoints"] == 0
+    assert third.phase == "idle"
+    assert third.revision == 2
+    assert third.setpoints == 0
     track = truth(single.truth, 3)
     assert Px4Mode.AUTO_LAND in track["custom_mode"]
     assert track["landed_state"][-1] == ON_GROUND
@@ -629,8 +629,8 @@ def test_a_companion_restarted_in_flight_gets_the_plan_and_leaves_its_vehicle_to
 
 def test_a_companion_restarted_in_flight_does_not_disturb_the_others(single: Single) -> None:
     for i in (1, 2):
-        assert single.restarted[i]["phase"] in SETTLED
-        assert failsafes(single.restarted[i]["failsafes"]) == []
+        assert single.restarted[i].phase in SETTLED
+        assert failsafes(single.restarted[i].failsafes) == []
     assert minimum_distance_m(single.truth) >= 1.2
 
 
