@@ -14,7 +14,7 @@ from typing import NamedTuple
 from companion.core.counts import RefusalKind
 from companion.core.route import Breach, examined, only_stops, slots_apart_m, slots_continue
 from companion.core.safety.fence import Fence
-from companion.core.trajectory.fleet import FleetTrajectory
+from companion.core.trajectory.fleet import REVISIONS, FleetTrajectory
 from companion.core.trajectory.goto import GOTO_ACCELERATION_M_S2, GotoPeaks, goto_peaks
 from companion.core.trajectory.legs import (
     TURN_RAMP_S,
@@ -270,10 +270,13 @@ def examine(motion: FleetTrajectory, limits: MotionLimits, before: FleetTrajecto
 
 
 def revision_fault(revision: int, own: int, told: Iterable[int]) -> str | None:
-    """Why a motion's revision is out of all order: too far ahead of one's own newest and of every one `told` by a peer.
+    """Why a motion's revision is out of all order: none that can be told, or too far ahead of one's own newest and of
+    every one `told` by a peer.
 
     Whoever starts late holds revision 0 and hears from the others' states how far they are.
     """
+    if revision >= REVISIONS:
+        return "the revisions of motions are used up"
     newest = max([own, *told])
     if revision > newest + REVISION_JUMP_MAX:
         return f"its revision {revision} is more than {REVISION_JUMP_MAX} ahead of {newest}, the newest known"

@@ -20,8 +20,8 @@ from companion.errors import CompanionError
 from companion.io.clock import FleetClock
 from companion.io.link import Link, open_link
 from companion.io.network import operator_link
+from companion.vehicle.autopilot.adapters import open_autopilot
 from companion.vehicle.autopilot.port import AutopilotPort
-from companion.vehicle.autopilot.px4 import Px4Autopilot
 from companion.vehicle.preflight import own_checks
 from companion.wire.operator import Check, tidy
 
@@ -64,7 +64,7 @@ def _autopilot(config: FleetConfig, vehicle: Vehicle, seconds: float) -> Iterato
         return
     try:
         yield Check("link", vehicle.mavlink, "opens", True, "")
-        autopilot = Px4Autopilot(config, vehicle)
+        autopilot = open_autopilot(config, vehicle)
         clock = FleetClock()
         received = listen(link, autopilot, clock, seconds)
         yield Check("bytes", received, "> 0", received > 0, f"nothing came on {vehicle.mavlink} in {seconds:g} s")

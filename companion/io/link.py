@@ -17,7 +17,7 @@ from companion.config.derived import Vehicle
 from companion.config.endpoints import serial_endpoint, udp_endpoint
 from companion.errors import CompanionError
 from companion.io.clock import realtime_to_monotonic
-from companion.wire.mavlink import FrameSplitter
+from companion.wire.mavlink_frames import FrameSplitter
 
 SO_TIMESTAMPNS = 35
 """asm-generic/socket.h; Python's socket module does not name it"""

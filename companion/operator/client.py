@@ -18,7 +18,7 @@ from companion.config import FleetConfig
 from companion.config.schema import GotoLegTable
 from companion.core.frames import Ned
 from companion.core.route import only_stops
-from companion.core.trajectory.fleet import FleetTrajectory
+from companion.core.trajectory.fleet import REVISIONS, FleetTrajectory
 from companion.core.trajectory.legs import Leg, TurnLeg, VelocityLeg
 from companion.core.trajectory.successors import with_legs
 from companion.core.trajectory_check import examine
@@ -38,8 +38,6 @@ ENDING_TIMEOUTS_S = (1.0, 1.0, 2.0, 1.0)
 """what ends a flight is commanded anew after these, to whoever is silent or has begun another flight meanwhile"""
 KILL_STATUS_TIMEOUT_S = 0.6
 PREFLIGHT_TIMEOUT_S = 3.0
-REVISIONS = 1 << 32
-"""of motions, on the wire"""
 REASON_LENGTH_MAX = 500
 
 

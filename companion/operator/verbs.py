@@ -34,9 +34,20 @@ FLEET_TOML = Path("fleet.toml")
 
 
 def mount(app: typer.Typer) -> None:
-    """Add every verb to a command."""
+    """Add every verb to a command, and `init`."""
+    app.command()(init)
     for verb in (status, preflight, takeoff, land, rtl, hold, form, move, release, resume, kill):
         app.command(rich_help_panel=PANEL)(verb)
+
+
+def init(
+    folder: Annotated[Path, typer.Argument(help="Where the files go.")] = Path(),
+) -> None:
+    """Write the shipped fleet.toml and the companion's systemd unit, to be edited. Overwrites nothing."""
+    from companion.shipped import write_shipped
+
+    for path in write_shipped(folder):
+        typer.echo(f"written: {path}")
 
 
 @contextmanager

@@ -11,6 +11,7 @@ from companion.core.trajectory.history import TrajectoryHistory
 from companion.core.values import FILTERED_PHASES, FLYING_PHASES, ZERO, Instant, Phase
 from companion.vehicle.autopilot.port import HOLD, AutopilotPort, FlightMode
 
+ALTITUDE_TOLERANCE_M = 0.4
 HOLD_MARGIN_M = 1.0
 """hold mode this far below the take-off's altitude is the pilot's doing, not the take-off's end"""
 
@@ -61,15 +62,18 @@ class Flight:
         return self.phase in FILTERED_PHASES and not self.positioned
 
     @property
-    def stopped_low(self) -> bool:
-        """Whether a climb has ended in hold mode below the altitude of take-off, before the autopilot is engaged."""
-        below = self.config.fleet.frame == "global" and -self.autopilot.position_ned_m.down < self._low_m
-        holds = self.autopilot.mode == HOLD and self.engaging_since_ns is None
-        return self.phase is Phase.CLIMBING and self.positioned and holds and below
+    def at_altitude(self) -> bool:
+        """Whether the climb is over: by the altitude, or by the autopilot's holding."""
+        climbed_m = -self.autopilot.position_ned_m.down
+        return climbed_m > self.config.formation.altitude_m - ALTITUDE_TOLERANCE_M or self.autopilot.mode == HOLD
 
     @property
-    def _low_m(self) -> float:
-        return self.config.formation.altitude_m - HOLD_MARGIN_M
+    def stopped_low(self) -> bool:
+        """Whether a climb has ended in hold mode below the altitude of take-off, before the autopilot is engaged."""
+        low_m = self.config.formation.altitude_m - HOLD_MARGIN_M
+        below = self.config.fleet.frame == "global" and -self.autopilot.position_ned_m.down < low_m
+        holds = self.autopilot.mode == HOLD and self.engaging_since_ns is None
+        return self.phase is Phase.CLIMBING and self.positioned and holds and below
 
     def observe(self, now: Instant, positioned: bool) -> bool:
         """Take what several detectors go by; whether the position has jumped since the last tick that took a jump."""

@@ -28,13 +28,12 @@ from companion.core.phase import PhaseEvent, next_phase
 from companion.core.trajectory.fleet import Reference
 from companion.core.trajectory.history import TrajectoryHistory
 from companion.core.values import FILTERED_PHASES, FLYING_PHASES, SETTLED_PHASES, Instant, Phase, VehicleState
-from companion.vehicle.autopilot.port import HOLD, LAND, OFFBOARD, TAKE_OFF, AutopilotPort, Verb
+from companion.vehicle.autopilot.port import LAND, OFFBOARD, TAKE_OFF, AutopilotPort, Verb
 from companion.vehicle.detectors import DETECTORS, Finding, Note
 from companion.vehicle.flight import Flight
 from companion.vehicle.follower import Follower
 from companion.vehicle.pending import STREAM_BEFORE_NS, PendingCommands
 
-ALTITUDE_TOLERANCE_M = 0.4
 BEING_KILLED = "it is being killed"
 
 
@@ -84,7 +83,7 @@ class Supervisor:
     def stopped(self) -> bool:
         """Whether nothing hangs in the air on this process."""
         landing = self.phase is Phase.LANDING and self.flight.land_seen
-        return self._pending.none and (self.phase not in FLYING_PHASES or landing)
+        return self._pending.none and (landing or self.phase not in FLYING_PHASES)
 
     @property
     def steers(self) -> bool:
@@ -309,16 +308,15 @@ class Supervisor:
 
     def _lead_climb(self, now: Instant) -> None:
         """Once at altitude, stream setpoints, and then have the autopilot follow them."""
-        flight, ap = self.flight, self.autopilot
+        flight = self.flight
         if not flight.positioned or flight.stopped_low:
             return
-        reached = -ap.position_ned_m.down > self.config.formation.altitude_m - ALTITUDE_TOLERANCE_M
         if flight.engaging_since_ns is None:
-            if reached or ap.mode == HOLD:
+            if flight.at_altitude:
                 flight.engaging_since_ns = now.monotonic_ns
                 self._restart_filter()
         elif now.monotonic_ns - flight.engaging_since_ns > STREAM_BEFORE_NS:
-            ap.engage()
+            self.autopilot.engage()
 
     def _lead_formation(self, now: Instant) -> None:
         """The phases that follow from the fleet's trajectory."""

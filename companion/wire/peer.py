@@ -21,7 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from companion.core.frames import Ned
 from companion.core.law.base import FIELDS_MAX
-from companion.core.trajectory.fleet import FleetTrajectory
+from companion.core.trajectory.fleet import REVISIONS, FleetTrajectory
 from companion.core.trajectory.goto import GOTO_MIN_S
 from companion.core.trajectory.legs import GotoLeg, Leg, TurnLeg, VelocityLeg
 from companion.core.trajectory.slots import BLEND_MIN_S, SlotChange
@@ -171,7 +171,7 @@ class _GotoLeg(_Model):
 
 class _Motion(_Model):
     version: Literal[3]
-    revision: Annotated[int, Field(ge=0, lt=1 << 32)]
+    revision: Annotated[int, Field(ge=0, lt=REVISIONS)]
     start_ns: Annotated[int, Field(ge=0, lt=1 << 63)]
     issuer: Annotated[int, Field(ge=0, le=255)]
     shape: Annotated[str, Field(max_length=32)]

@@ -13,7 +13,7 @@ os.environ["MAVLINK20"] = "1"
 from pymavlink.dialects.v20 import development as mavlink
 
 from companion.core.frames import Geodetic, Ned, ned_to_geodetic
-from companion.wire.mavlink import unpacked, whole_frame
+from companion.wire.mavlink_frames import is_one_frame
 from sim.autopilot.commander import HOME_SET_NS, Commander, Result, TakeoffState
 from sim.autopilot.commands import CommandRequest, answer, set_mode
 from sim.autopilot.dynamics import (
@@ -33,6 +33,7 @@ from sim.autopilot.link import COMPONENT_ID, Link, StreamSchedule
 from sim.autopilot.modes import Mode
 from sim.autopilot.navigator import Navigator
 from sim.autopilot.offboard import SetpointFields, SetpointStream, decode_setpoint
+from sim.autopilot.packing import unpacked
 from sim.autopilot.parameters import ParameterTable, loop_gains
 from sim.autopilot.services import Services
 from sim.autopilot.telemetry import Telemetry
@@ -48,6 +49,7 @@ BATTERY_DRAIN_PER_STEP = 1.0 / 60.0 * STEP_S
 """while armed, a sixtieth a second; down to half, and full again when disarmed, as recorded"""
 BATTERY_LOWEST_FRACTION = 0.5
 SETPOINT = mavlink.MAVLink_set_position_target_local_ned_message
+SETPOINT_KEY = SETPOINT.id.to_bytes(3, "little")
 NO_OFFSET = Ned(0.0, 0.0, 0.0)
 
 
@@ -163,7 +165,7 @@ class Autopilot:
     def receive(self, datagram: bytes, now_ns: int) -> None:
         """Takes what arrived from the link at `now_ns`; answers wait for the next `advance`."""
         self._catch_up(now_ns)
-        if whole_frame(datagram) == SETPOINT.id and self.link.mav.buf_len() == 0:
+        if is_one_frame(datagram) and datagram[7:10] == SETPOINT_KEY and self.link.mav.buf_len() == 0:
             # What comes many times a second is read without pymavlink's objects; what is damaged goes the long way.
             values = unpacked(SETPOINT, datagram)
             if values is not None:

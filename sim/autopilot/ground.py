@@ -9,8 +9,9 @@ import socket
 from contextlib import suppress
 from typing import Any
 
+from pymavlink.dialects.v20 import development as mavlink
+
 from companion.core.frames import Geodetic, ned_to_geodetic
-from companion.wire.mavlink import dialect as mavlink
 from sim.autopilot.autopilot import Autopilot
 from sim.autopilot.link import Link, StreamSchedule
 from sim.autopilot.streams import STREAMS

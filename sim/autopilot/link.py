@@ -9,7 +9,7 @@ from typing import Any
 os.environ["MAVLINK20"] = "1"
 from pymavlink.dialects.v20 import development as mavlink
 
-from companion.wire.mavlink import frame, packed
+from sim.autopilot.packing import frame, packed
 from sim.autopilot.streams import ON_REQUEST, STREAMS, Fields
 from sim.autopilot.telemetry import Telemetry
 

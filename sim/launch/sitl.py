@@ -9,6 +9,7 @@ import os
 import select
 import signal
 import socket
+import struct
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -18,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pymavlink.dialects.v20 import development as mavlink
 
 from companion.config import FleetConfig
 from companion.config.derived import Vehicle
@@ -25,8 +27,7 @@ from companion.core.frames import Geodetic, Ned, geodetic_to_ned, ned_to_geodeti
 from companion.errors import CompanionError
 from companion.io.link import SO_TIMESTAMPNS, received_unix_ns
 from companion.vehicle.autopilot.px4_versions import same_setting
-from companion.wire.mavlink import dialect as mavlink
-from companion.wire.mavlink import interval_parameters, parameter_value
+from companion.wire.px4 import interval_parameters, parameter_value
 from sim.autopilot.stubs import TRUTH_DTYPE
 from sim.launch.ended import tell_ended
 from sim.launch.px4_instance import FLEET_PARAMETERS, SIMULATOR_PARAMETERS, Px4Instance
@@ -223,7 +224,9 @@ class SitlHost:
                 case mavlink.MAVLink_extended_sys_state_message():
                     instance.landed_state = message.landed_state
                 case mavlink.MAVLink_param_value_message():
-                    instance.checked[message.param_id.rstrip("\x00")] = parameter_value(message)
+                    instance.checked[message.param_id.rstrip("\x00")] = parameter_value(
+                        struct.pack("<f", message.param_value), message.param_type
+                    )
 
     def _read_truth(self, instance: _Instance) -> None:
         rows = []

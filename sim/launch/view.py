@@ -60,6 +60,7 @@ class FlightView:
         head = f"{progress.elapsed_s:6.1f} s  {progress.doing}: {phases(fleet)}{_nearest(fleet)}"
         ended = [f"companion {i}, {how_it_ended(s)}" for i, s in sorted(progress.ended.items())]
         ended += [f"vehicle {i}: {how}" for i, how in sorted(progress.autopilots_ended.items())]
+        ended += [f"vehicle {i}: {s.killed}" for i, s in sorted(fleet.items()) if s and s.killed]
         lines = [head, *([f"ended: {', '.join(ended)}"] if ended else [])]
         if self._live is not None:
             width, height = self._console.size

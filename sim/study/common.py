@@ -195,7 +195,10 @@ def fingerprint(config: Config) -> str:
     digest = blake2s(digest_size=8)
     digest.update(config.text.encode())
     if config.name not in FLOWN_STUDIES:
-        digest.update(swarm.kernels().source_hash().encode())
+        swarm.kernels()
+        from sim.swarm.compiled import source_hash
+
+        digest.update(source_hash().encode())
     module = study_module(config.name)
     for path in (module.__file__, swarm.__file__, *getattr(module, "SOURCES", ())):
         digest.update(Path(str(path)).read_bytes())

@@ -27,10 +27,11 @@ def step_costs(setup: Setup, seed: int, steps: int, relative_speed_m_s: float) -
     round every two seconds; everything runs on them as in any other study, but for their dynamics.
     """
     loops = kernels()
+    from sim.swarm import exchange
+
     n = setup.formation.count
-    plain, *rules = swarm.run_options(replace(setup, barrier=False)), *swarm.rules_of(setup)
-    filtered = swarm.run_options(replace(setup, barrier=True))
-    g, ig, et, st, it = rules
+    plain, filtered = (swarm.run_options(replace(setup, barrier=b)) for b in (False, True))
+    g, ig, et, st, it = swarm.rules_of(setup)
     table = reference_table(setup, steps + 6)
     x, v = starts(setup, seed)
     rng = np.random.default_rng([seed, 5])
@@ -52,8 +53,8 @@ def step_costs(setup: Setup, seed: int, steps: int, relative_speed_m_s: float) -
         loops.place_slots(k, s, table)
         loops.measure(k, s, plain)
         loops.filter_own(k, s, plain)
-        loops.send(k, k, s, table, plain, et, st, it, ig)
-        loops.predict_all(k, s, table, plain, ig)
+        exchange.send(k, k, s, table, plain, et, st, it, ig)
+        exchange.predict_all(k, s, table, plain, ig)
         law = time.thread_time_ns()
         loops.command(k, s, table, plain, g, ig)
         middle = time.thread_time_ns()

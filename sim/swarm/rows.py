@@ -1,4 +1,4 @@
-"""The compiled law, called as the plain one is: for whoever compares the two."""
+"""Law and safety filter over the rows of one agent's neighbours, compiled; and the law as the plain one is called."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,16 +7,63 @@ import numpy as np
 
 from companion.core.frames import Ned
 from companion.core.law.base import Wanted
-from companion.core.law.starling import Gains
+from companion.core.law.starling import Gains, Sums
+from companion.core.safety import filter as safety
 from companion.core.trajectory.fleet import Reference
 from companion.core.values import Neighbour, VehicleState
-from sim.swarm import kernels
-from sim.swarm.kernels import Floats
+from sim.swarm.compiled import avoid, combine, half_plane, kernel, mean_residual, out_of_reach, share
+from sim.swarm.state import ROW, Floats
+
+
+@kernel
+def neighbour(rows: Floats, k: int) -> Neighbour:
+    """Row k as the core's functions take it."""
+    last_seen = None
+    if rows[k, 12] > 0.0:
+        last_seen = Ned(rows[k, 13], rows[k, 14], rows[k, 15])
+    return Neighbour(
+        0, Ned(rows[k, 0], rows[k, 1], rows[k, 2]), Ned(rows[k, 3], rows[k, 4], rows[k, 5]),
+        Ned(rows[k, 6], rows[k, 7], rows[k, 8]), 0.0, rows[k, 9] > 0.0, rows[k, 10] > 0.0, rows[k, 11], last_seen,
+        Ned(rows[k, 16], rows[k, 17], rows[k, 18]), Ned(rows[k, 19], rows[k, 20], rows[k, 21]), (),
+    )  # fmt: skip
+
+
+@kernel
+def sums_over(ego: VehicleState, slot_velocity: Ned, rows: Floats, count: int, alone: bool, g: Gains) -> Sums:
+    """`law.sums_over` of the first `count` rows, rounded after each term."""
+    sx, sy, sz, vx, vy, vz, px, py, pz, rx, ry, rz, n = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(count):
+        q = share(ego, slot_velocity, neighbour(rows, k), alone, g)
+        sx, sy, sz = sx + q.sep_x, sy + q.sep_y, sz + q.sep_z
+        vx, vy, vz = vx + q.vel_x, vy + q.vel_y, vz + q.vel_z
+        px, py, pz = px + q.pos_x, py + q.pos_y, pz + q.pos_z
+        rx, ry, rz, n = rx + q.res_x, ry + q.res_y, rz + q.res_z, n + q.formed
+    return Sums(sx, sy, sz, vx, vy, vz, px, py, pz, rx, ry, rz, n)
+
+
+@kernel
+def constrain(
+    u_north: float, u_east: float, ego: VehicleState, shared: Ned, rows: Floats, count: int, most: float,
+    planes: Floats, spare: Floats,
+) -> safety.Avoidance:  # fmt: skip
+    """What `safety.SafetyFilter` makes of a command for the sake of the first `count` rows; see `safety.half_plane`."""
+    peers = 0
+    for k in range(count):
+        n = neighbour(rows, k)
+        if out_of_reach(ego, shared, n, most):
+            continue
+        h = half_plane(ego, shared, n)
+        planes[peers, 0], planes[peers, 1], planes[peers, 2] = h.g_north, h.g_east, h.b
+        planes[peers, 3], planes[peers, 4] = h.v_north, h.v_east
+        peers += 1
+    return avoid(
+        u_north, u_east, ego.velocity_ned_m_s.north, ego.velocity_ned_m_s.east, planes, peers, peers, most, spare
+    )
 
 
 def as_rows(neighbours: Sequence[Neighbour]) -> Floats:
     """Neighbours as the kernels keep them, shape (at least 1, ROW)."""
-    rows = np.zeros((max(len(neighbours), 1), kernels.ROW))
+    rows = np.zeros((max(len(neighbours), 1), ROW))
     for row, n in zip(rows, neighbours, strict=False):
         last = n.last_seen_ned_m
         row[:] = (
@@ -38,8 +85,8 @@ class CompiledLaw:
     ) -> Wanted:
         """See `Law`."""
         rows, slot_velocity = as_rows(neighbours), reference.velocity_ned_m_s
-        sums = kernels.sums_over(ego, slot_velocity, rows, len(neighbours), alone, self.gains)
-        return Wanted(Ned(*kernels.combine(sums, ego, reference, self.gains)), kernels.mean_residual(sums))
+        sums = sums_over(ego, slot_velocity, rows, len(neighbours), alone, self.gains)
+        return Wanted(Ned(*combine(sums, ego, reference, self.gains)), mean_residual(sums))
 
     def reset(self) -> None:
         """Nothing is kept."""

@@ -24,9 +24,7 @@ from companion.core.safety.filter import COLLISION_DISTANCE_M, LAG_ALLOWANCE_M
 from companion.core.trigger.error import ErrorTrigger
 from companion.core.trigger.switching import SwitchingTrigger
 from companion.errors import ConfigError
-
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
+from sim.swarm.state import MEASURES, ROW, SAMPLE, Floats, Ints, Options, State
 
 DENSE_MAX = 200
 """up to here every ordered pair may have its own row"""
@@ -442,7 +440,7 @@ def run_options(setup: Setup) -> Any:
     own_held = setup.reading in ("V1", "V1b")
     elastic = setup.trigger == "elastic"
     fault = setup.fault != "none"
-    return kernels().Options(
+    return Options(
         dt=setup.dt_s,
         dt_ns=round(setup.dt_s * 1e9),
         every=setup.control_every,
@@ -517,8 +515,10 @@ class NeighbourList:
 
     def update(self, x: Floats) -> bool:
         """Make the list good for positions x, shape (N, 3); returns whether it had to be rebuilt."""
-        loops = kernels()
-        if self._then is not None and loops.largest_shift(x, self._then) <= SKIN_M / 2:
+        kernels()
+        from sim.swarm import grid
+
+        if self._then is not None and grid.largest_shift(x, self._then) <= SKIN_M / 2:
             return False
         reach = self.range_m + SKIN_M
         low = x.min(axis=0)
@@ -529,11 +529,11 @@ class NeighbourList:
         count = np.zeros(int(shape.prod()) + 1, dtype=np.int64)
         cell = np.zeros(len(x), dtype=np.int64)
         order = np.zeros(len(x), dtype=np.int64)
-        loops.cells(x, low, width, shape, cell, count, order)
+        grid.cells(x, low, width, shape, cell, count, order)
         self.start = np.zeros(len(x) + 1, dtype=np.int64)
         column = self.column if self.column.size else np.zeros(64 * len(x), dtype=np.int64)
         while True:
-            needed = loops.listed(x, low, width, shape, count, order, reach, self.start, column)
+            needed = grid.listed(x, low, width, shape, count, order, reach, self.start, column)
             if needed <= column.size:
                 break
             column = np.zeros(int(needed * 1.1), dtype=np.int64)
@@ -579,7 +579,7 @@ def with_list(s: Any, near: NeighbourList) -> Any:
 def _room(width: int) -> dict[str, Any]:
     """Where one agent's neighbours are laid out."""
     return {
-        "near": np.zeros((width, kernels().ROW)), "near_row": np.zeros(width, dtype=np.int64),
+        "near": np.zeros((width, ROW)), "near_row": np.zeros(width, dtype=np.int64),
         "planes": np.zeros((width, 5)), "spare": np.zeros((width, 3)), "scratch": np.zeros((2, width)),
     }  # fmt: skip
 
@@ -588,7 +588,6 @@ def state_of(
     setup: Setup, seed: int, o: Any, table: Floats, x: Floats, v: Floats, slots: Floats, near: "NeighbourList | None"
 ) -> Any:
     """The kernels' state at the start; every pair is listed where no neighbour list is given."""
-    loops = kernels()
     n = len(x)
     steps = round(setup.duration_s / setup.dt_s)
     start = np.arange(n + 1, dtype=np.int64) * (n - 1)
@@ -601,19 +600,19 @@ def state_of(
     kept = -(-steps // setup.keep_every)
     depth = o.delay + 1 if o.links else 1
     ring_digest = max(o.digest, 1)
-    s = loops.State(
+    s = State(
         x=x, v=v, a=np.zeros((n, 3)), gust=np.zeros((n, 3)), bias=np.zeros((n, 3)), measured=np.zeros((n, 6)),
         filtered=np.zeros((n, 6)), u=np.zeros((n, 3)), common=np.zeros((n, 3)), anchor=np.zeros((n, 3)),
-        anchor_speed=np.zeros((n, 3)), sent=np.zeros((n, loops.SAMPLE)), sent_step=np.full(n, -1, dtype=np.int64),
+        anchor_speed=np.zeros((n, 3)), sent=np.zeros((n, SAMPLE)), sent_step=np.full(n, -1, dtype=np.int64),
         limit=np.zeros(n), clock=np.zeros(n), own=np.zeros((n, 12)), residual=np.zeros((n, 3)), neighbours=np.zeros(n),
         observed=np.zeros((n, 6)), predicted=np.zeros((rows, 12)),
-        held=np.zeros((rows if o.links else 1, loops.SAMPLE)),
+        held=np.zeros((rows if o.links else 1, SAMPLE)),
         held_step=np.full(rows if o.links else 1, -1, dtype=np.int64), stopped=np.zeros((rows, 3)),
         offset=np.ascontiguousarray(slots), slot=np.zeros((n, 3)),
         start=start, column=column,
-        ring=np.zeros((depth, n if o.links else 1, loops.SAMPLE)),
+        ring=np.zeros((depth, n if o.links else 1, SAMPLE)),
         ring_step=np.full((depth, n), -1, dtype=np.int64),
-        ring_digest=np.zeros((depth, n if o.links else 1, ring_digest, loops.SAMPLE)),
+        ring_digest=np.zeros((depth, n if o.links else 1, ring_digest, SAMPLE)),
         ring_digest_step=np.zeros((depth, n if o.links else 1, ring_digest), dtype=np.int64),
         ring_digest_id=np.full((depth, n if o.links else 1, ring_digest), -1, dtype=np.int64),
         outage=np.zeros(rows, dtype=np.uint8), keys=agent_keys(seed, n),
@@ -668,7 +667,7 @@ def run(setup: Setup, seed: int, *, reference: Floats | None = None, start: tupl
         steps_dynamic=int(s.counts[2]),
         steps_fixed=int(s.counts[3]),
         filter_active=int(s.counts[4]),
-        measures=dict(zip(loops.MEASURES, map(float, s.measures), strict=True)),
+        measures=dict(zip(MEASURES, map(float, s.measures), strict=True)),
     )
 
 

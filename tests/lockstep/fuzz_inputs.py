@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple
 
 from companion.config import FleetConfig
 from companion.core.frames import Ned
-from companion.core.trajectory.fleet import PADS, FleetTrajectory
+from companion.core.trajectory.fleet import PADS, REVISIONS, FleetTrajectory
 from companion.core.trajectory.goto import GOTO_MIN_S
 from companion.core.trajectory.legs import GotoLeg, Leg, TurnLeg, VelocityLeg
 from companion.core.trajectory.slots import BLEND_MIN_S, SlotChange
@@ -143,7 +143,9 @@ class Inputs:
             lambda: {"slots": {i: SlotChange(c.after, c.before) for i, c in motion.slots.items()}},
         ]
         changed = replace(motion, **r.choice(makers)())
-        return replace(changed, revision=min(max(changed.revision, 0), 2**32 - 1), then=r.choice(["stay", motion.then]))
+        return replace(
+            changed, revision=min(max(changed.revision, 0), REVISIONS - 1), then=r.choice(["stay", motion.then])
+        )
 
     # -- messages and commands ---------------------------------------------------------------------------------------
 
@@ -155,7 +157,8 @@ class Inputs:
         return PeerSample(
             about, fleet_ns + r.choice([0, -(10**8), -(10**10), 9 * 10**8, -(2**62), 2**62]),
             Ned(*(x + r.uniform(-spread, spread) for x in place)), Ned(*(r.uniform(-fast, fast) for _ in range(3))),
-            r.choice([newest.revision, 0, newest.revision + 1, 2**32 - 1]), r.choice(list(Phase)),
+            min(r.choice([newest.revision, 0, newest.revision + 1, REVISIONS - 1]), REVISIONS - 1),
+            r.choice(list(Phase)),
         )  # fmt: skip
 
     def message(self, about: int, newest: FleetTrajectory, fleet_ns: int) -> PeerMessage:

@@ -32,8 +32,8 @@ from companion.core.trajectory.successors import with_legs
 from companion.core.values import Instant, Phase
 from companion.errors import RefusedError
 from companion.operator.client import Operator, turn_leg, velocity_leg
-from companion.wire.mavlink import Px4Mode
 from companion.wire.peer import encode_motion
+from companion.wire.px4 import Px4Mode
 from sim.autopilot.faults import Fault, FaultKind
 from sim.lockstep.lockstep import Lockstep
 from sim.lockstep.network import NetworkParameters

@@ -27,9 +27,9 @@ from companion.core.trajectory.successors import with_legs
 from companion.core.values import ZERO, Instant, Phase
 from companion.operator.client import Operator, velocity_leg
 from companion.vehicle.agent import Agent
-from companion.wire.mavlink import Px4Mode
 from companion.wire.operator import Place
 from companion.wire.peer import encode_motion
+from companion.wire.px4 import Px4Mode
 from sim.lockstep.lockstep import Lockstep
 
 pytestmark = pytest.mark.timeout(600)

@@ -7,7 +7,7 @@ import pytest
 from flights import fleet, launch, parse, set_parameter, until, until_formed, wait
 
 from companion.core.values import Instant, Phase
-from companion.wire.mavlink import Px4Mode
+from companion.wire.px4 import Px4Mode
 from sim.autopilot.faults import Fault, FaultKind
 from sim.lockstep.lockstep import Lockstep
 

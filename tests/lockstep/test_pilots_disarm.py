@@ -10,7 +10,7 @@ from flights import failsafes, fleet, launch, parse, until, until_formed, until_
 from pymavlink.dialects.v20 import development as dialect
 
 from companion.core.values import Instant, Phase
-from companion.wire.mavlink import FORCE, Px4Mode
+from companion.wire.px4 import FORCE, Px4Mode
 from sim.lockstep.lockstep import Lockstep
 
 GROUND_STATION: Any = dialect.MAVLink(None, srcSystem=255, srcComponent=190)

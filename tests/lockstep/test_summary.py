@@ -19,8 +19,8 @@ from companion.core.trajectory.history import TrajectoryHistory
 from companion.core.trajectory.legs import VelocityLeg
 from companion.core.trajectory.successors import with_legs
 from companion.core.values import Phase
-from companion.wire.mavlink import Px4Mode
 from companion.wire.peer import encode_motion
+from companion.wire.px4 import Px4Mode
 from sim.autopilot.faults import Fault, FaultKind
 from sim.launch.summary.flight import Flight
 from sim.launch.summary.summarise import summarise

@@ -8,7 +8,7 @@ from flights import failsafes, first, fleet, launch, until, until_formed, wait
 from pymavlink.dialects.v20 import development as dialect
 
 from companion.core.values import Instant, Phase
-from companion.wire.mavlink import Px4Mode, arm_parameters, mode_parameters, takeoff_parameters
+from companion.wire.px4 import Px4Mode, arm_parameters, mode_parameters, takeoff_parameters
 from sim.autopilot.faults import Fault, FaultKind
 from sim.lockstep.lockstep import Lockstep
 

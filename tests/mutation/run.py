@@ -1,4 +1,4 @@
-"""Mutants of the safety filter, its program and the phases: each must fail a test or stand explained in survivors.toml.
+"""Mutants of safety filter, program, near mode and phases: each must fail a test or stand explained in survivors.toml.
 
 mutmut changes what is inside functions; what is outside of them (constants, defaults, the table of transitions) is
 changed here. All of it happens in a copy, in a temporary directory.
@@ -25,10 +25,11 @@ import typer
 
 ROOT = Path(__file__).resolve().parents[2]
 EXPLAINED = Path(__file__).with_name("survivors.toml")
-_PROGRAM, _SAFETY, _FENCE = (f"tests/unit/test_{x}.py" for x in ("program", "safety", "fence"))
+_PROGRAM, _SAFETY, _FENCE, _NEAR = (f"tests/unit/test_{x}.py" for x in ("program", "safety", "fence", "near"))
 SOURCES = {
     "companion/core/safety/filter.py": (_SAFETY, _FENCE, _PROGRAM),
     "companion/core/safety/program.py": (_PROGRAM, _SAFETY, _FENCE),
+    "companion/core/near.py": (_NEAR,),
     "companion/core/phase.py": ("tests/unit/test_phase.py",),
 }
 """what is changed, and the tests of which one must fail then, the likeliest first"""
@@ -126,7 +127,7 @@ def _others(value: object) -> list[object]:
     if isinstance(value, int):
         return [value - 1, value + 1]
     if isinstance(value, float):
-        return [round(0.9 * value, 12), round(1.1 * value, 12)] if value else [-1.0, 1.0]
+        return [float(f"{0.9 * value:.9g}"), float(f"{1.1 * value:.9g}")] if value else [-1.0, 1.0]
     return [f"XX{value}XX"] if isinstance(value, str) else []
 
 

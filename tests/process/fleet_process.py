@@ -30,6 +30,8 @@ from sim.autopilot.stubs import TRUTH_DTYPE
 
 PORTS = range(26_000, 32_000, 100)
 """clear of PX4's, of the fleets' scouting and of the ephemeral ones"""
+WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+"""two lanes of tests look for free ports at one time: each has every other block"""
 PATIENCE_S = 120.0
 """how long a test waits for what must come; far above what it takes on an idle machine"""
 STUB_PORT_OFFSET = 40
@@ -68,7 +70,8 @@ def _free(ports: list[int]) -> bool:
 def make_fleet(folder: Path, count: int, *, name: str | None = None, scouting: int | None = None, **more: Any) -> Fleet:
     """A low and quick fleet of `count` vehicles in `folder`; `more` are further tables of its file."""
     number = next(_numbers)
-    blocks = [PORTS[(os.getpid() * 7 + number * 13 + k) % len(PORTS)] for k in range(len(PORTS))]
+    ours = PORTS[WORKER % 2 :: 2]
+    blocks = [ours[(os.getpid() * 7 + number * 13 + k) % len(ours)] for k in range(len(ours))]
     port = next(b for b in blocks if _free([b + k + way for k in range(count) for way in (0, STUB_PORT_OFFSET)]))
     name = name or f"test-{os.getpid()}-{number}"
     tables: dict[str, Any] = {

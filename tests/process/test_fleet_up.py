@@ -44,8 +44,10 @@ from fleet_process import (
     truth,
     wait_status,
 )
+from pymavlink.dialects.v20 import development as dialect
 
 from companion.__main__ import main as companion_main
+from companion.core.events import KillCause
 from companion.core.failsafe import Failsafe
 from companion.core.frames import Ned
 from companion.core.values import PeerMessage, PeerSample, Phase
@@ -59,9 +61,9 @@ from companion.io.zenoh.configuration import (
     zenoh_configuration,
 )
 from companion.operator.client import Operator
-from companion.wire.mavlink import Px4Mode, dialect
 from companion.wire.operator import Status
 from companion.wire.peer import encode_state
+from companion.wire.px4 import Px4Mode
 from sim.__main__ import main as fleet_main
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(400)]
@@ -436,6 +438,31 @@ def test_without_a_terminal_progress_is_a_line_now_and_then(loss: Loss) -> None:
     assert "\x1b" not in loss.err
     assert len(lines) < 40
     assert "minimum distance" in loss.out
+
+
+# -- the operator kills -----------------------------------------------------------------------------------------------
+
+
+def test_a_fleet_that_its_operator_kills_in_flight_falls_is_shown_as_killed_and_fails(tmp_path: Path) -> None:
+    fleet = make_fleet(tmp_path, 2)
+    out = tmp_path / "flights"
+    arguments = ("sim", "up", "--json", "--fleet", str(fleet.file), "--out", str(out), "--plan", FOR_EVER)
+    with started(*arguments, folder=tmp_path, name="up") as up:
+        with operator_of(fleet) as operator:
+            wait_status(operator, all_in(fleet.ids, "waiting", *SETTLED))
+        killed = run("sim", "kill", "--yes", "--fleet", str(fleet.file), folder=tmp_path)
+        assert killed.returncode == 0, killed.stderr
+        assert up.wait(30.0) == 1
+    summary = json.loads(up.out)
+    assert summary["passed"] is False
+    assert summary["killed"] == {str(i): KillCause.COMMAND.value for i in fleet.ids}
+    assert [c["met"] for c in summary["criteria"] if c["what"] == "vehicles killed"] == [False]
+    (command,) = (c for c in summary["commands"] if c["verb"] == "kill")
+    assert (command["accepted"], command["refused"], command["unanswered"]) == (fleet.ids, {}, [])
+    for i in fleet.ids:
+        track = truth(flight_folder(out) / "truth.bin", i)
+        assert track["armed"][-1] == 0
+        assert track["velocity_ned_m_s"][:, 2].max() > 2.0
 
 
 # -- the launcher itself dies ----------------------------------------------------------------------------------------

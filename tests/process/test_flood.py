@@ -25,8 +25,8 @@ from companion.io.records import TickRecord
 from companion.io.replay import replay_file
 from companion.io.zenoh.configuration import session_settings, zenoh_configuration
 from companion.operator.client import Operator
-from companion.wire.mavlink import Px4Mode
 from companion.wire.peer import motion_from_json
+from companion.wire.px4 import Px4Mode
 from sim.launch.reference_loop import read_reference_loop
 
 pytestmark = [pytest.mark.process, pytest.mark.long, pytest.mark.timeout(900)]

@@ -16,8 +16,7 @@ from typing import Any
 import pytest
 import tomli_w
 from fleet_process import STUB_PORT_OFFSET, Fleet, eventually, make_fleet, operator_of, run, started, truth, wait_status
-
-from companion.wire.mavlink import dialect
+from pymavlink.dialects.v20 import development as dialect
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(400)]
 

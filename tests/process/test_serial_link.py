@@ -18,7 +18,7 @@ from stub_process import QUICK
 from companion.core.frames import Ned
 from companion.errors import CompanionError
 from companion.io.link import SERIAL_UNSENT_MOST, SerialLink
-from companion.wire.mavlink import FrameSplitter
+from companion.wire.mavlink_frames import FrameSplitter
 from sim.autopilot.autopilot import Autopilot
 from sim.autopilot.dynamics import GustParameters, NoiseParameters
 from sim.autopilot.parameters import defaults

@@ -6,10 +6,11 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from pymavlink.dialects.v20 import development as dialect
+
 from companion.config import FleetConfig
 from companion.core.values import Instant
 from companion.vehicle.agent import Agent
-from companion.wire.mavlink import dialect
 
 
 class AgentOnLink:

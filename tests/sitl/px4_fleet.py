@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import socket
 import time
 from collections.abc import Iterator
@@ -13,11 +14,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from fleet_process import Fleet, Process, flight_folder, make_fleet, operator_of, started, wait_status
+from pymavlink.dialects.v20 import development as dialect
 
 from companion.core.trajectory.history import TrajectoryHistory
 from companion.io.recorder import read_recording
 from companion.operator.client import Operator
-from companion.wire.mavlink import Px4Mode, dialect, mode_parameters
+from companion.wire.px4 import Px4Mode, mode_parameters
 from sim.autopilot.stubs import TRUTH_DTYPE
 from sim.launch.summary.flight import Flight as FlightRecord
 
@@ -46,6 +48,12 @@ class Flying:
     @property
     def folder(self) -> Path:
         return flight_folder(self.fleet.folder / "flights")
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """What the launcher has written at the flight's end."""
+        summary: dict[str, Any] = json.loads((self.folder / "summary.json").read_text())
+        return summary
 
     def wait(self, phase: str, *ids: int) -> None:
         """Until these vehicles (or all) are in that phase; who moves or holds has formed."""
@@ -128,11 +136,11 @@ class Flying:
 
 
 @contextmanager
-def flying(fleet: Fleet, build: Path, *more: str) -> Iterator[Flying]:
-    """`fleet up --autopilot px4`, from its start to its end."""
+def flying(fleet: Fleet, build: Path, *more: str, shown: bool = False) -> Iterator[Flying]:
+    """`fleet up --autopilot px4`, from its start to its end; shown as to people, or its summary alone as JSON."""
     out = fleet.folder / "flights"
     out.mkdir()
-    arguments = ("sim", "up", "--fleet", str(fleet.file), "--out", str(out), "--json")
+    arguments = ("sim", "up", "--fleet", str(fleet.file), "--out", str(out), *(() if shown else ("--json",)))
     how = more or ("--autopilot", "px4", "--px4", str(build))
     with started(*arguments, *how, folder=fleet.folder, name="up") as up, operator_of(fleet) as operator:
         yield Flying(fleet, up, operator)

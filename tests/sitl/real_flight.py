@@ -94,6 +94,14 @@ class RealFlight:
                     return int(message.result)
         return None
 
+    def version(self) -> tuple[int, int]:
+        """PX4's, as it tells it."""
+        seen = len(self.received)
+        assert self.command(mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION) == 0
+        self.run(0.5)
+        (told,) = (m for _, m in self.received[seen:] if m.get_type() == "AUTOPILOT_VERSION")
+        return told.flight_sw_version >> 24, told.flight_sw_version >> 16 & 0xFF
+
     def stream_at(self, message_id: int, rate_hz: float) -> None:
         assert self.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, 1e6 / rate_hz) == 0
 

@@ -19,5 +19,6 @@ def flight(build: Path, tmp_path: Path) -> Iterator[RealFlight]:
 
 
 def test_px4_answers_as_the_table_says(flight: RealFlight) -> None:
-    wrong = [line for row in (*ON_THE_GROUND, *IN_THE_AIR) for line in mismatches(flight, row)]
+    version = flight.version()
+    wrong = [line for row in (*ON_THE_GROUND, *IN_THE_AIR) for line in mismatches(flight, row, version)]
     assert wrong == []

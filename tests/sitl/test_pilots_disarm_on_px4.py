@@ -8,10 +8,11 @@ from typing import Any
 import pytest
 from agent_on_link import AgentOnLink
 from px4_fleet import GCS_PORT, GROUND_STATION
+from pymavlink.dialects.v20 import development as dialect
 
 from companion.config import FleetConfig, load
 from companion.core.values import Phase
-from companion.wire.mavlink import FORCE, dialect
+from companion.wire.px4 import FORCE
 from sim.launch.px4_instance import FLEET_PARAMETERS, Px4Instance
 
 DELAYS_S = (0.1, 0.3, 0.6, 0.9, 1.2, 1.6, 2.0)

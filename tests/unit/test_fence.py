@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely import LineString, Point, Polygon
 
+from companion.core.counts import OTHER
 from companion.core.frames import Ned
 from companion.core.safety.fence import (
     FENCE_POLE_PER_S,
@@ -74,6 +75,7 @@ def applied(
 ) -> SafeSetpoint:
     s = f.apply(c, ego, neighbours, bias, DT_S)
     assert s is not None
+    assert OTHER not in f.counts, "whatever acts has a name of its own"
     return s
 
 

@@ -19,7 +19,7 @@ from sim.launch.watch import LANDING_TIMEOUT_S, POLL_S, UNHEARD_S, MissingError,
 Said = dict[int, Status | None]
 
 
-def status(phase: str, armed: bool = True, age_s: float = 0.5) -> Status:
+def status(phase: str, armed: bool = True, age_s: float | None = 0.5) -> Status:
     return statuses.status(phase=phase, armed=armed, autopilot_age_s=age_s)
 
 

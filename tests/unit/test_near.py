@@ -49,6 +49,7 @@ def test_a_peer_stays_near_for_a_second_after_it_was_found_so() -> None:
     m.see([3], HOLD_NS // 2)
     assert m.peers(HOLD_NS - 1) == (3, 7)
     assert m.peers(HOLD_NS) == (3,)
+    assert m.active(HOLD_NS)
     assert m.peers(HOLD_NS // 2 + HOLD_NS) == ()
     assert not m.active(HOLD_NS // 2 + HOLD_NS)
 
@@ -104,6 +105,16 @@ def test_slots_keep_their_distance_up_to_5_cm_s_along_any_axis(rate_m_s: float, 
         assert (push < PUSH_M_S2) is steady
         alike = near_push_m_s2(in_slots(offset, slot_velocity=velocity), velocity, CLOSEST_M, RADIUS_M)
         assert alike == pytest.approx(left, abs=0.2)
+
+
+@pytest.mark.parametrize("velocity", [Ned(1.0, -1.0, 0.0), Ned(0.0, 1.0, -1.0), Ned(1.0, 0.0, -1.0)])
+def test_slots_that_turn_about_each_other_on_a_slope_keep_their_distance(velocity: Ned) -> None:
+    """Along each axis they approach or part; the parts cancel."""
+    side_m = CLOSEST_M / 2.0
+    turning = in_slots(Ned(side_m, side_m, side_m), slot_velocity=velocity)
+    standing = in_slots(Ned(side_m, side_m, side_m))
+    expected = near_push_m_s2(standing, ZERO, CLOSEST_M, RADIUS_M)
+    assert near_push_m_s2(turning, ZERO, CLOSEST_M, RADIUS_M) == expected < PUSH_M_S2
 
 
 def test_height_between_slots_counts_by_the_downwash() -> None:
@@ -172,6 +183,12 @@ def test_the_push_is_what_just_breaks_the_half_plane(distance_m: float, closing_
     assert kept is (push <= push_m_s2(plane)) or push == pytest.approx(push_m_s2(plane))
 
 
+def test_the_push_is_told_in_m_s2_whatever_the_half_planes_scale_and_direction() -> None:
+    """A gradient is shorter than 1 where the peer is above or below."""
+    assert push_m_s2(HalfPlane(0.3, -0.4, -1.0)) == pytest.approx(2.0)
+    assert push_m_s2(HalfPlane(0.0, 0.1, 0.3)) == pytest.approx(-3.0)
+
+
 def test_at_rest_a_pair_that_shares_the_avoidance_is_near_from_2_m_on_at_the_default_radius() -> None:
     radius_m = 0.65 + BOUND_M
     assert resting_push_m_s2(2.25, radius_m) < PUSH_M_S2 < resting_push_m_s2(2.3, radius_m)
@@ -199,6 +216,13 @@ def test_the_bound_of_a_near_peer_is_the_triggers_until_its_sample_is_old(age_s:
 def test_two_periods_without_a_message_are_covered_by_the_triggers_bound() -> None:
     assert missing_m(0.2, BOUND_M, MOTION) == 0.0
     assert missing_m(0.3, BOUND_M, MOTION) > 0.1
+
+
+@pytest.mark.parametrize("bound_m", [0.1, BOUND_M, 3.0])
+def test_the_bound_is_certain_up_to_the_age_at_which_its_growth_meets_the_cap(bound_m: float) -> None:
+    age_s = certain_age_s(bound_m, MOTION)
+    assert missing_m(age_s - 1e-6, bound_m, MOTION) < MISSING_MAX_M
+    assert missing_m(age_s + 1e-6, bound_m, MOTION) == MISSING_MAX_M
 
 
 @given(

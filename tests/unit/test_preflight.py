@@ -12,6 +12,7 @@ from companion.config import FleetConfig, load
 from companion.core.frames import Geodetic, Ned, ned_to_geodetic
 from companion.vehicle.autopilot.port import AutopilotFacts, Estimate
 from companion.vehicle.autopilot.px4_parameters import PARAMETERS, identity_checks, parameter_checks, parameter_rules
+from companion.vehicle.autopilot.px4_versions import RENAMED, same_setting
 from companion.vehicle.preflight import own_checks
 from companion.wire.operator import Check, PreflightReport, decode, encode, unmet
 
@@ -285,6 +286,13 @@ def test_the_assignments_hash_follows_slots_and_vehicles() -> None:
 
     wider = load(FILE, widen)
     assert wider.assignment_hash != CONFIG.assignment_hash
+
+
+def test_every_name_of_a_renamed_setting_is_read_and_judged() -> None:
+    for renamed in RENAMED:
+        assert {renamed.before, renamed.after} <= set(PARAMETERS)
+        assert same_setting(renamed.before) == same_setting(renamed.after) == (renamed.before, renamed.after)
+    assert same_setting("GF_ACTION") == ("GF_ACTION",)
 
 
 def test_the_name_under_which_this_px4_has_a_setting_is_enough_and_one_is_needed() -> None:

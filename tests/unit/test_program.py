@@ -1,6 +1,7 @@
 """The small program of the safety filter, against an oracle that tries every point where a solution can lie."""
 
 import random
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from math import cos, dist, hypot, pi, sin, sqrt
@@ -226,6 +227,7 @@ def test_the_command_is_the_oracles(kind: str) -> None:
 def test_the_command_is_the_oracles_in_many_states(kind: str) -> None:
     counts = judged(kind, range(1000, 31_000))
     assert counts.get("decided by rounding", 0) <= (600 if kind == "degenerate" else 0), counts
+    sys.stdout.write(f"{kind}: {counts}\n")
 
 
 # -- the filter --------------------------------------------------------------------------------------------------------
@@ -318,7 +320,7 @@ def test_the_filter_flies_the_oracles_command() -> None:
 
 @pytest.mark.long
 def test_the_filter_flies_the_oracles_command_in_many_states() -> None:
-    judged_filter(range(1000, 31_000))
+    sys.stdout.write(f"filter: {judged_filter(range(1000, 31_000))}\n")
 
 
 # -- cases by hand -----------------------------------------------------------------------------------------------------

@@ -24,8 +24,7 @@ from companion.vehicle.autopilot.port import OFFBOARD, FlightMode, Verb
 from companion.vehicle.autopilot.px4 import Px4Autopilot
 from companion.vehicle.autopilot.px4_parameters import PARAMETERS
 from companion.vehicle.autopilot.requests import RETRY_S, TRIES
-from companion.wire import mavlink as wire
-from companion.wire.mavlink import Px4Mode
+from companion.wire.px4 import STREAMS_HZ, STREAMS_OFF, Px4Mode, arm_parameters, takeoff_parameters
 
 SYSTEM_ID = 7
 FLEET = Geodetic(47.397742, 8.545594, 488.0)
@@ -220,7 +219,7 @@ def test_a_heartbeat_goes_out_every_second() -> None:
 def test_the_streams_are_asked_for_one_after_the_other() -> None:
     one = px4()
     one.heartbeat(0.0)
-    wanted = [*wire.STREAMS_HZ, *wire.STREAMS_OFF]
+    wanted = [*STREAMS_HZ, *STREAMS_OFF]
     for k, message_id in enumerate(wanted):
         now = 0.01 * k
         one.hear(now)
@@ -231,7 +230,7 @@ def test_the_streams_are_asked_for_one_after_the_other() -> None:
 
 def test_a_request_is_repeated_until_it_is_answered() -> None:
     one = ready()
-    one.client.requests.ask("arming", *wire.arm_parameters(True))
+    one.client.requests.ask("arming", *arm_parameters(True))
     one.run(10.0, 11.2)
     assert one.times_of(400) == pytest.approx([10.0, 10.5, 11.0])
     one.answer(400, 0, 11.2)
@@ -241,7 +240,7 @@ def test_a_request_is_repeated_until_it_is_answered() -> None:
 
 def test_a_request_that_is_never_answered_is_given_up_and_noted() -> None:
     one = ready()
-    one.client.requests.ask("arming", *wire.arm_parameters(True))
+    one.client.requests.ask("arming", *arm_parameters(True))
     one.run(10.0, 10.0 + TRIES * RETRY_S + 1.0)
     assert len(one.times_of(400)) == TRIES
     assert RequestUnanswered("arming") in one.client.events
@@ -250,7 +249,7 @@ def test_a_request_that_is_never_answered_is_given_up_and_noted() -> None:
 def test_the_same_request_is_not_queued_twice() -> None:
     one = ready()
     for _ in range(50):
-        one.client.requests.ask("arming", *wire.arm_parameters(True))
+        one.client.requests.ask("arming", *arm_parameters(True))
     one.hear(10.0)
     one.answer(400, 0, 10.01)
     one.run(10.05, 12.0)
@@ -261,7 +260,7 @@ def test_a_refusal_is_noted_and_the_request_not_repeated_at_once() -> None:
     one = ready()
     for k in range(100):
         now = 10.0 + 0.02 * k
-        one.client.requests.ask("arming", *wire.arm_parameters(True))
+        one.client.requests.ask("arming", *arm_parameters(True))
         if any(m.get_type() == "COMMAND_LONG" and m.command == 400 for m in one.hear(now)):
             one.answer(400, 2, now + 0.001)
     assert 3 <= len(one.times_of(400)) <= 5
@@ -272,7 +271,7 @@ def test_a_refusal_is_noted_and_the_request_not_repeated_at_once() -> None:
 @pytest.mark.parametrize("result", [1, 5], ids=["temporarily rejected", "in progress"])
 def test_an_answer_that_decides_nothing_leaves_the_request_open(result: int) -> None:
     one = ready()
-    one.client.requests.ask("arming", *wire.arm_parameters(True))
+    one.client.requests.ask("arming", *arm_parameters(True))
     one.hear(10.0)
     one.answer(400, result, 10.1)
     one.run(10.1, 11.0)
@@ -283,7 +282,7 @@ def test_an_answer_that_decides_nothing_leaves_the_request_open(result: int) -> 
 def test_an_answer_to_nothing_asked_is_counted() -> None:
     one = ready()
     one.answer(400, 0, 10.0)
-    one.client.requests.ask("arming", *wire.arm_parameters(True))
+    one.client.requests.ask("arming", *arm_parameters(True))
     one.answer(400, 0, 10.0)
     one.hear(10.0)
     assert one.times_of(400) == [10.0]
@@ -303,7 +302,7 @@ def test_a_new_mode_takes_the_place_of_the_one_before() -> None:
 
 def test_what_is_withdrawn_is_not_repeated_and_its_late_answer_is_no_surprise() -> None:
     one = ready()
-    one.client.requests.ask("take-off", *wire.takeoff_parameters(498.0))
+    one.client.requests.ask("take-off", *takeoff_parameters(498.0))
     one.hear(10.0)
     one.client.withdraw(Verb.TAKE_OFF, Verb.ARM)
     one.run(10.05, 10.4)
@@ -317,7 +316,7 @@ def test_what_is_withdrawn_is_not_repeated_and_its_late_answer_is_no_surprise() 
 
 def test_what_is_withdrawn_before_it_was_sent_is_never_sent() -> None:
     one = ready()
-    one.client.requests.ask("arming", *wire.arm_parameters(True))
+    one.client.requests.ask("arming", *arm_parameters(True))
     one.client.withdraw(Verb.ARM)
     one.run(10.0, 12.0)
     assert one.times_of(400) == []
@@ -325,7 +324,7 @@ def test_what_is_withdrawn_before_it_was_sent_is_never_sent() -> None:
 
 def test_after_cancelling_nothing_but_heartbeats_is_sent() -> None:
     one = ready()
-    one.client.requests.ask("arming", *wire.arm_parameters(True))
+    one.client.requests.ask("arming", *arm_parameters(True))
     one.client.engage()
     one.client.cancel()
     one.run(10.0, 15.0)
@@ -335,7 +334,7 @@ def test_after_cancelling_nothing_but_heartbeats_is_sent() -> None:
 def test_the_next_deadline_is_when_something_is_due() -> None:
     one = ready()
     one.run(10.0, 20.0)
-    one.client.requests.ask("arming", *wire.arm_parameters(True))
+    one.client.requests.ask("arming", *arm_parameters(True))
     deadlines = []
     now_ns = at(20.0).monotonic_ns
     for _ in range(30):

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from companion.core.counts import OTHER
 from companion.core.frames import Ned
 from companion.core.safety.filter import (
     COLLISION_DISTANCE_M,
@@ -58,6 +59,7 @@ def peer(
 def applied(f: SafetyFilter, c: Command, ego: VehicleState, neighbours: Sequence[Neighbour] = ()) -> SafeSetpoint:
     setpoint = f.apply(c, ego, neighbours, ZERO, DT_S)
     assert setpoint is not None
+    assert OTHER not in f.counts, "whatever acts has a name of its own"
     return setpoint
 
 
@@ -287,6 +289,15 @@ def test_a_peer_out_of_reach_binds_no_command(
         assert plane.b <= -most * hypot(plane.g_north, plane.g_east) + 1e-9
 
 
+def test_the_filter_tells_the_half_planes_of_the_peers_within_reach_as_of_its_last_command() -> None:
+    f, ego = SafetyFilter(LIMITS), state()
+    near, far = peer(Ned(2.0, 0.0, 0.0)), peer(Ned(1000.0, 0.0, 0.0), vehicle_id=3)
+    applied(f, command(), ego, [near, far])
+    assert f.peer_planes == [half_plane(ego, ZERO, near)]
+    applied(f, command(), ego, [far])
+    assert f.peer_planes == []
+
+
 @pytest.mark.parametrize("shares", [True, False])
 @pytest.mark.parametrize("closing", [0.0, 2.0, 8.0])
 def test_the_reach_is_not_much_longer_than_it_must_be(shares: bool, closing: float) -> None:
@@ -458,6 +469,7 @@ def test_whatever_comes_in_a_setpoint_is_finite_or_none(
         if s is not None:
             assert all(isfinite(x) for x in s)
             assert hypot(*acceleration(s)) <= LIMITS.avoidance_acceleration_m_s2 * (1 + 1e-9)
+    assert OTHER not in f.counts
     ordinary = f.apply(command(), state(), [], ZERO, DT_S)
     assert ordinary is not None
     assert isfinite(ordinary.velocity_north_m_s)

@@ -24,7 +24,10 @@ from companion.core.trigger.periodic import PeriodicTrigger
 from companion.core.trigger.switching import SwitchingTrigger
 from companion.core.values import ZERO, Command, Neighbour, PeerSample, Phase, VehicleState
 from companion.errors import ConfigError
-from sim.swarm.rows import CompiledLaw, as_rows
+from sim.swarm import compiled as core
+from sim.swarm.exchange import hold_weights
+from sim.swarm.rows import CompiledLaw, as_rows, constrain
+from sim.swarm.state import HOLD_DAMPED, HOLD_FIRST, HOLD_ZERO
 from sim.swarm.swarm import (
     Formation,
     NeighbourList,
@@ -99,7 +102,6 @@ def test_the_law_that_is_flown_is_the_one_that_is_compiled(states: int) -> None:
 @MANY
 def test_the_filter_that_is_flown_is_the_one_that_is_compiled(states: int) -> None:
     """From predictions to the command, downwash and lost peers' segments included, in scenes that can be met or not."""
-    loops = kernels()
     rng = np.random.default_rng(states)
     most, apart, seen = 8.0, [], [0, 0, 0]
     limits = safety.SafetyLimits(1e6, 1e6, 1e6, 1e9, most)
@@ -111,7 +113,7 @@ def test_the_filter_that_is_flown_is_the_one_that_is_compiled(states: int) -> No
         flown = safety.SafetyFilter(limits)
         flown.apply(Command(Ned(*u, 0.0), ZERO, ZERO, asked, 0.0), ego, around, ZERO, 0.02)
         room = np.zeros((len(around), 5)), np.zeros((len(around), 3))
-        compiled = loops.constrain(*u, ego, asked, as_rows(around), len(around), most, *room)
+        compiled = constrain(*u, ego, asked, as_rows(around), len(around), most, *room)
         assert compiled.peer == (flown.counts["peer distance"] > 0)
         missed = flown.counts["peer distance not attainable"] > 0
         assert (compiled.peers_missed_m_s2 > 1e-6) == missed
@@ -126,7 +128,6 @@ def test_the_filter_that_is_flown_is_the_one_that_is_compiled(states: int) -> No
 @MANY
 def test_the_walls_of_a_program_are_flown_as_they_are_compiled(states: int) -> None:
     """The swarm has no fence, but its program is the one with walls."""
-    loops = kernels()
     rng = np.random.default_rng(states)
     most, apart = 8.0, []
     for _ in range(states):
@@ -134,7 +135,7 @@ def test_the_walls_of_a_program_are_flown_as_they_are_compiled(states: int) -> N
         peers = int(rng.integers(0, count + 1))
         rows = np.hstack([rng.normal(size=(count, 2)), rng.normal(0.0, 4.0, (count, 3))]).tolist()
         u, v = rng.uniform(-5.6, 5.6, 2).tolist(), rng.normal(0.0, 1.5, 2).tolist()
-        compiled = loops.avoid(*u, *v, np.array(rows), peers, count, most, np.zeros((count, 3)))
+        compiled = core.avoid(*u, *v, np.array(rows), peers, count, most, np.zeros((count, 3)))
         flown = safety.avoid(*u, *v, rows, peers, count, most, [[0.0] * 3 for _ in rows])
         assert (compiled.peer, compiled.wall) == (flown.peer, flown.wall)
         assert compiled[4:] == pytest.approx(flown[4:], abs=1e-6)
@@ -145,10 +146,9 @@ def test_the_walls_of_a_program_are_flown_as_they_are_compiled(states: int) -> N
 
 @MANY
 def test_the_prediction_that_is_flown_is_the_one_that_is_compiled(states: int) -> None:
-    loops = kernels()
     rng = np.random.default_rng(states)
     kinds: list[tuple[HoldKind, int]] = [
-        ("damped", loops.HOLD_DAMPED), ("first", loops.HOLD_FIRST), ("zero", loops.HOLD_ZERO)
+        ("damped", HOLD_DAMPED), ("first", HOLD_FIRST), ("zero", HOLD_ZERO)
     ]  # fmt: skip
     limits = load(FLEET).peer_limits
     for k in range(states):
@@ -158,15 +158,14 @@ def test_the_prediction_that_is_flown_is_the_one_that_is_compiled(states: int) -
         then, now = (ned(rng, 20.0), ned(rng, 1.0)), Reference(ned(rng, 20.0), ned(rng, 1.0), ZERO, 0.0)
         ns = round(tau_s * 1e9)
         flown = predict_sample(sample, then, now, ns, replace(limits, hold=kind))
-        w = loops.hold_weights(code, ns * 1e-9, limits.hold_damping_s)
+        w = hold_weights(code, ns * 1e-9, limits.hold_damping_s)
         axes = zip(sample.position_ned_m, sample.velocity_ned_m_s, *then, now[0], now[1], strict=True)
-        compiled = [loops.axis(p, v, p0, v0, p1, v1, w) for p, v, p0, v0, p1, v1 in axes]
+        compiled = [core.axis(p, v, p0, v0, p1, v1, w) for p, v, p0, v0, p1, v1 in axes]
         assert pytest.approx(np.array(flown), rel=1e-12, abs=1e-12) == np.array(compiled).T
 
 
 @MANY
 def test_the_triggers_that_are_flown_are_the_ones_that_are_compiled(states: int) -> None:
-    loops = kernels()
     rng = np.random.default_rng(states)
     error, switching = ErrorTrigger(0.3, 0.1, 0.3), SwitchingTrigger(0.5, 0.1, 0.3, 0.01, 0.02, 0.3)
     periodic = PeriodicTrigger(0.05)
@@ -177,8 +176,8 @@ def test_the_triggers_that_are_flown_are_the_ones_that_are_compiled(states: int)
         now = Situation(p2, v2, r2, float(rng.uniform(0.0, 20.0)), ns, ns - int(rng.integers(0, 10**8)))
         flown = error.fires(now), switching.fires(now), periodic.fires(now)
         compiled = (
-            loops.exceeds(p2, v2, r2, error), loops.switching_exceeds(p2, v2, now.formation_s, switching),
-            loops.period_ended(now.time_ns, now.sent_ns, 50_000_000),
+            core.exceeds(p2, v2, r2, error), core.switching_exceeds(p2, v2, now.formation_s, switching),
+            core.period_ended(now.time_ns, now.sent_ns, 50_000_000),
         )  # fmt: skip
         assert compiled == flown
         fired = [n + f for n, f in zip(fired, flown, strict=True)]

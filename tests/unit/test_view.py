@@ -14,7 +14,8 @@ from statuses import status
 from companion.errors import WireError
 from companion.operator.views import status_table
 from companion.wire.operator import Status, as_json, decode
-from sim.launch.view import show_summary
+from sim.launch.view import FlightView, show_summary
+from sim.launch.watch import Progress
 
 LONG = "its clock is 0.341 s behind that of vehicle 3, " * 12
 REMARKS = st.text(max_size=300) | st.sampled_from([LONG, "[red]bold[/red]", "\x1b[2J\n\n\r\t", "飛行" * 60, ""])
@@ -136,3 +137,17 @@ def test_the_summary_shows_who_commanded_what_and_who_was_killed(capsys: pytest.
     assert "vehicle 3: killed by command" in said
     assert "vehicle 2: PX4 ended with status -9" in said
     assert said.endswith("not met: vehicles killed <= 0, got 1 not passed")
+
+
+def test_without_a_terminal_a_vehicle_that_is_killed_is_told_at_once_and_once(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    flying, killed = status(phase="moving"), status(phase="released", killed="killed by command")
+    with FlightView(quiet=False) as view:
+        for elapsed_s, second in ((0.0, flying), (1.0, killed), (2.0, killed)):
+            view.show(Progress(elapsed_s, "flying", {1: flying, 2: second}, {}))
+    told = capsys.readouterr().err.splitlines()
+    assert [("vehicle 2: killed by command" in line, "1 killed" in line) for line in told] == [
+        (False, False),
+        (True, True),
+    ]

@@ -7,7 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import development as dialect
 
-from companion.wire.mavlink import FrameSplitter, Heartbeat, LocalPosition, MavlinkCodec
+from companion.wire.mavlink import Heartbeat, LocalPosition, MavlinkCodec
+from companion.wire.mavlink_frames import FrameSplitter
 
 SYSTEM_ID = 7
 

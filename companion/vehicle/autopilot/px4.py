@@ -33,10 +33,11 @@ from companion.vehicle.autopilot.px4_versions import same_setting
 from companion.vehicle.autopilot.requests import STREAM, Requests
 from companion.vehicle.autopilot.round_trips import RoundTrips
 from companion.wire import mavlink as wire
-from companion.wire.mavlink import MavlinkCodec, Px4Mode, mode_name
+from companion.wire import px4
+from companion.wire.mavlink import MavlinkCodec
+from companion.wire.px4 import Px4Mode, mode_name
 
 CLOCK_SAMPLES = 5
-RATE_WINDOW_NS = 2_000_000_000
 ON_GROUND = 1
 """EXTENDED_SYS_STATE's landed state; 0 is unknown"""
 FLAGS_NEEDED = 1 | 2 | 4
@@ -109,8 +110,6 @@ class Px4Autopilot:
         self._next_heartbeat_ns = 0
         self._next_origin_ns = 0
         self._origin_doubted = False
-        self._arrivals_ns: deque[int] = deque(maxlen=512)
-        """of the latest positions"""
         self._round_trips = RoundTrips()
         self._clock_ahead_ns: deque[int] = deque(maxlen=CLOCK_SAMPLES)
 
@@ -171,14 +170,13 @@ class Px4Autopilot:
 
     def _set_up(self) -> None:
         """Ask for what we read, and for no more: a companion's link may be a serial line."""
-        streams = {**wire.STREAMS_HZ, wire.POSITION_MESSAGE_ID: self.config.limits.control_rate_hz}
-        streams |= dict.fromkeys(wire.STREAMS_OFF, 0.0)
+        streams = {**px4.STREAMS_HZ, px4.POSITION_MESSAGE_ID: self.config.limits.control_rate_hz}
+        streams |= dict.fromkeys(px4.STREAMS_OFF, 0.0)
         for message_id, rate_hz in streams.items():
-            self.requests.ask(f"{STREAM} {message_id}", *wire.interval_parameters(message_id, rate_hz))
+            self.requests.ask(f"{STREAM} {message_id}", *px4.interval_parameters(message_id, rate_hz))
 
     def _position(self, message: wire.LocalPosition, now: Instant) -> bool:
-        passed_ns = now.monotonic_ns - self._arrivals_ns[-1] if self._arrivals_ns else 0
-        boot_ms = self.boot.unwrapped(message.boot_ms, passed_ns)
+        boot_ms = self.boot.unwrapped(message.boot_ms, now.monotonic_ns)
         if self.boot.rebooted(boot_ms):
             self._rebooted()
             boot_ms = message.boot_ms
@@ -186,7 +184,6 @@ class Px4Autopilot:
             self.counts["position repeated"] += 1
             return False
         made_ns = self.boot.arrived(boot_ms, now.monotonic_ns)
-        self._arrivals_ns.append(now.monotonic_ns)
         if self.frame is None:
             return False
         self.position_ns = made_ns
@@ -225,27 +222,27 @@ class Px4Autopilot:
 
     def arm(self) -> None:
         """Let the motors turn; sent once."""
-        self.requests.ask(REQUESTS[Verb.ARM], *wire.arm_parameters(True), once=True)
+        self.requests.ask(REQUESTS[Verb.ARM], *px4.arm_parameters(True), once=True)
 
     def take_off(self, altitude_amsl_m: float) -> None:
         """Climb; NaN: to PX4's MIS_TAKEOFF_ALT."""
-        self.requests.ask(REQUESTS[Verb.TAKE_OFF], *wire.takeoff_parameters(altitude_amsl_m))
+        self.requests.ask(REQUESTS[Verb.TAKE_OFF], *px4.takeoff_parameters(altitude_amsl_m))
 
     def engage(self) -> None:
         """OFFBOARD, which PX4 enters only while setpoints stream."""
-        self.requests.ask_mode(REQUESTS[Verb.ENGAGE], *wire.mode_parameters(Px4Mode.OFFBOARD))
+        self.requests.ask_mode(REQUESTS[Verb.ENGAGE], *px4.mode_parameters(Px4Mode.OFFBOARD))
 
     def hold(self) -> None:
         """AUTO.LOITER."""
-        self.requests.ask_mode(REQUESTS[Verb.HOLD], *wire.mode_parameters(Px4Mode.AUTO_LOITER))
+        self.requests.ask_mode(REQUESTS[Verb.HOLD], *px4.mode_parameters(Px4Mode.AUTO_LOITER))
 
     def land(self) -> None:
         """AUTO.LAND."""
-        self.requests.ask_mode(REQUESTS[Verb.LAND], *wire.mode_parameters(Px4Mode.AUTO_LAND))
+        self.requests.ask_mode(REQUESTS[Verb.LAND], *px4.mode_parameters(Px4Mode.AUTO_LAND))
 
     def kill(self) -> None:
         """Disarm by force."""
-        self.requests.ask(REQUESTS[Verb.KILL], *wire.kill_parameters())
+        self.requests.ask(REQUESTS[Verb.KILL], *px4.kill_parameters())
 
     def outcome(self, verb: Verb) -> Outcome | None:
         """What came of a verb, once a HEARTBEAT has come that knows of it."""
@@ -276,7 +273,7 @@ class Px4Autopilot:
             return out
         if self._asks_origin and now.monotonic_ns >= self._next_origin_ns:
             self._next_origin_ns = now.monotonic_ns + 1_000_000_000
-            out.append(self.codec.command(*wire.request_message_parameters(wire.ORIGIN_MESSAGE_ID)))
+            out.append(self.codec.command(*px4.request_message_parameters(px4.ORIGIN_MESSAGE_ID)))
         out += self.requests.due()
         if not self.armed:
             out += self._preflight_due(now.monotonic_ns)
@@ -372,14 +369,9 @@ class Px4Autopilot:
         p, v = self.position_ned_m, self.velocity_ned_m_s
         return Ned(p.north + v.north * age_s, p.east + v.east * age_s, p.down + v.down * age_s), v
 
-    def positions_heard_hz(self, now: Instant) -> float:
-        """Positions a second over the last two."""
-        since_ns = now.monotonic_ns - RATE_WINDOW_NS
-        return sum(t > since_ns for t in self._arrivals_ns) / (RATE_WINDOW_NS * 1e-9)
-
     def facts(self, now: Instant) -> AutopilotFacts:
         """What preflight judges."""
-        is_px4 = self.kind == wire.AUTOPILOT_PX4
+        is_px4 = self.kind == px4.AUTOPILOT_PX4
         parameters = self.parameters
         return AutopilotFacts(
             heartbeat_age_s=self.heartbeat_age_s(now),
@@ -392,7 +384,7 @@ class Px4Autopilot:
             home_altitude_amsl_m=self.home_altitude_amsl_m,
             position_ned_m=None if self.frame is None or self.position_ns is None else self.position_ned_m,
             position_age_s=self.position_age_s(now),
-            position_rate_hz=self.positions_heard_hz(now),
+            position_rate_hz=self.boot.heard_hz(now.monotonic_ns),
             battery_percent=self.battery(now),
             round_trip_s=self._round_trips.median_s(now.monotonic_ns, asking=not self.armed),
             # The least delayed of the last messages is nearest to the truth: delay makes the autopilot seem behind.

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from companion.config import FleetConfig
 from companion.vehicle.autopilot.px4_versions import same_setting
-from companion.wire import mavlink as wire
+from companion.wire import px4
 from companion.wire.operator import Check, tidy
 
 ROUNDING = 1e-6
@@ -90,11 +90,11 @@ def identity_checks(kind: int, vehicle_type: int) -> tuple[Check, ...]:
     """Whether it is a PX4 (MAV_AUTOPILOT), on a multicopter (MAV_TYPE)."""
     return (
         Check(
-            "autopilot", kind, f"= {wire.AUTOPILOT_PX4} (PX4)", kind == wire.AUTOPILOT_PX4,
+            "autopilot", kind, f"= {px4.AUTOPILOT_PX4} (PX4)", kind == px4.AUTOPILOT_PX4,
             f"autopilot is no PX4 (MAV_AUTOPILOT {kind})", permanent=True,
         ),
         Check(
-            "vehicle type", vehicle_type, "a multicopter", vehicle_type in wire.MULTICOPTERS,
+            "vehicle type", vehicle_type, "a multicopter", vehicle_type in px4.MULTICOPTERS,
             f"vehicle is no multicopter (MAV_TYPE {vehicle_type})", permanent=True,
         ),
     )  # fmt: skip

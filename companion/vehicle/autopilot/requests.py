@@ -12,6 +12,7 @@ from companion.core.counts import Counts
 from companion.core.events import Event, RequestRefused, RequestUnanswered
 from companion.vehicle.autopilot.port import Outcome
 from companion.wire import mavlink as wire
+from companion.wire import px4
 
 RETRY_S = 0.5
 TRIES = 8
@@ -111,7 +112,7 @@ class Requests:
     def answered(self, answer: wire.CommandAnswer, now_ns: int) -> None:
         """An answer came."""
         queue = self._queues.get(answer.command)
-        if answer.command == wire.REQUEST_MESSAGE:
+        if answer.command == px4.REQUEST_MESSAGE:
             return  # asked for again until the message itself comes
         if not queue or queue[0].tries == 0:
             self._counts["answer to nothing asked"] += 1

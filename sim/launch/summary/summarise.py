@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from companion.core.events import FailsafeActed, Killed
-from companion.wire.mavlink import Px4Mode
+from companion.wire.px4 import Px4Mode
 from sim.launch.summary.believed import STEP_NS, believed_errors, times_of
 from sim.launch.summary.believed import minimum_distance_m as believed_minimum_m
 from sim.launch.summary.criteria import criteria

@@ -1,0 +1,88 @@
+"""PX4 as it shows in MAVLink: its modes, the commands that it is given, the streams that it is asked for."""
+
+import struct
+from enum import IntEnum
+from math import nan
+
+AUTOPILOT_PX4 = 12
+"""MAV_AUTOPILOT"""
+MULTICOPTERS = frozenset({2, 3, 4, 13, 14, 15, 29})
+"""MAV_TYPE: quadrotor, coaxial, helicopter, hexarotor, octorotor, tricopter, dodecarotor"""
+PARAMETER_INT32, PARAMETER_REAL32 = 6, 9
+"""MAV_PARAM_TYPE"""
+ORIGIN_MESSAGE_ID = 49
+POSITION_MESSAGE_ID = 32
+POSITION_RATE_HZ = 50.0
+STREAMS_HZ = {POSITION_MESSAGE_ID: POSITION_RATE_HZ, 436: 20.0, 245: 5.0, 230: 1.0, 1: 1.0, 2: 1.0, 242: 0.5}
+"""what the companion asks for with SET_MESSAGE_INTERVAL"""
+STREAMS_OFF = (30, 31, 33, 105, 331, 111, 141, 132, 83, 85, 36, 74, 24, 87)
+"""what a companion's link carries by default and nobody here reads"""
+NAV_TAKEOFF, DO_SET_MODE, COMPONENT_ARM_DISARM, SET_MESSAGE_INTERVAL, REQUEST_MESSAGE = 22, 176, 400, 511, 512
+"""MAV_CMD"""
+CUSTOM_MODE_ENABLED = 1
+"""MAV_MODE_FLAG"""
+FORCE = 21196.0
+"""param2 of COMPONENT_ARM_DISARM by which motors stop in flight too"""
+
+
+class Px4Mode(IntEnum):
+    """PX4's main modes and AUTO sub-modes as custom_mode (main << 16 | sub << 24)."""
+
+    MANUAL = 1 << 16
+    ALTCTL = 2 << 16
+    POSCTL = 3 << 16
+    AUTO_READY = 4 << 16 | 1 << 24
+    AUTO_TAKEOFF = 4 << 16 | 2 << 24
+    AUTO_LOITER = 4 << 16 | 3 << 24
+    AUTO_MISSION = 4 << 16 | 4 << 24
+    AUTO_RTL = 4 << 16 | 5 << 24
+    AUTO_LAND = 4 << 16 | 6 << 24
+    ACRO = 5 << 16
+    OFFBOARD = 6 << 16
+    STABILIZED = 7 << 16
+    TERMINATION = 10 << 16
+
+
+def mode_name(custom_mode: int) -> str:
+    """The mode's name, or its number."""
+    try:
+        return Px4Mode(custom_mode).name
+    except ValueError:
+        return f"{custom_mode:#x}"
+
+
+def parameter_value(raw: bytes, kind: int) -> float | int:
+    """Value of a PARAM_VALUE from its four bytes: PX4 puts an INT32 bytewise into the float."""
+    (value,) = struct.unpack("<i" if kind == PARAMETER_INT32 else "<f", raw)
+    return int(value) if kind == PARAMETER_INT32 else float(value)
+
+
+def arm_parameters(arm: bool) -> tuple[int, float]:
+    """Command and parameter of MAV_CMD_COMPONENT_ARM_DISARM."""
+    return COMPONENT_ARM_DISARM, 1.0 if arm else 0.0
+
+
+def kill_parameters() -> tuple[int, float, float]:
+    """Command and parameters that disarm at once, wherever the vehicle is."""
+    return COMPONENT_ARM_DISARM, 0.0, FORCE
+
+
+def mode_parameters(mode: Px4Mode) -> tuple[int, float, float, float]:
+    """Command and parameters of MAV_CMD_DO_SET_MODE for a PX4 mode."""
+    main, sub = (mode >> 16) & 0xFF, (mode >> 24) & 0xFF
+    return DO_SET_MODE, float(CUSTOM_MODE_ENABLED), float(main), float(sub)
+
+
+def takeoff_parameters(altitude_amsl_m: float) -> tuple[int, float, float, float, float, float, float, float]:
+    """Command and parameters of MAV_CMD_NAV_TAKEOFF: straight up, heading as it is."""
+    return NAV_TAKEOFF, nan, 0.0, 0.0, nan, nan, nan, altitude_amsl_m
+
+
+def interval_parameters(message_id: int, rate_hz: float) -> tuple[int, float, float]:
+    """Command and parameters of MAV_CMD_SET_MESSAGE_INTERVAL; a rate of 0 turns the stream off."""
+    return SET_MESSAGE_INTERVAL, float(message_id), 1e6 / rate_hz if rate_hz > 0 else -1.0
+
+
+def request_message_parameters(message_id: int) -> tuple[int, float]:
+    """Command and parameter of MAV_CMD_REQUEST_MESSAGE."""
+    return REQUEST_MESSAGE, float(message_id)
