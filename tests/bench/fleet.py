@@ -137,7 +137,7 @@ def start(
 def fly(
     vehicles: Annotated[int, typer.Option(min=1, max=250)] = 30,
     rate: Annotated[float, typer.Option(min=20, max=50, help="Control rate (Hz).")] = CONTROL_RATE_HZ,
-    seconds: Annotated[float, typer.Option(min=10, help="From take-off to the landing command.")] = 60.0,
+    seconds: Annotated[float, typer.Option(min=10, help="From take-off to the landing command.")] = 80.0,
 ) -> None:
     """Fly them by `fleet up`: lateness of their loops beside an empty one's."""
     with TemporaryDirectory() as name:
