@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-FLEETS = ("test_fleet_up.py",)
+FLEETS = ("test_fleet_up.py", "test_missing.py")
 """files of tests/process that fly whole fleets: half of the time of all"""
 TOGETHER = ("test_flight.py", "test_faults.py", "test_damaged_recordings.py")
 """files of tests/lockstep whose tests look at flights that they share"""

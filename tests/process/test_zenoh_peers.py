@@ -368,6 +368,7 @@ def test_somebody_else_speaking_under_our_id_is_counted_and_told_to_the_agent(fl
         double.network.publish("state", b"false")
         two.network.publish("state", b"true")
         one.wait_message("fleet/2/state", b"true")
+        one.wait_message("fleet/1/state", b"false")
         assert eventually(lambda: one.network.counters.own_id_heard == 1)
         assert sorted(one.messages()) == [("fleet/1/state", b"false"), ("fleet/2/state", b"true")]
 
