@@ -1,7 +1,6 @@
 """Command `companion`: one vehicle's companion process."""
 
 import json
-import os
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -41,22 +40,11 @@ def run(
     had not confirmed landing, 4 could do nothing any more (a fault of ours; the autopilot's failsafe has the vehicle).
     """
     from companion.config import load
-    from companion.io.loop import Companion, RunSettings
+    from companion.io.process import fly_vehicle
 
-    def log(text: str) -> None:
-        # Not through a buffer, which on a full disk would fail again at the end and change the exit status.
-        os.write(1, f"vehicle {vehicle}: {text}\n".encode())
-
-    from importlib.metadata import version
-
-    config = load(fleet)
-    settings = RunSettings(vehicle, record, sys.stdin.fileno() if launched else None, log, fleet)
-    companion = Companion(config, settings, {"config": fleet.read_text(), "version": version("starling-fleet")})
-    try:
-        status = companion.run()
-    finally:
-        companion.close()
-    raise typer.Exit(status)
+    config, text = load(fleet), fleet.read_text(encoding="utf-8")
+    stop_fd = sys.stdin.fileno() if launched else None
+    raise typer.Exit(fly_vehicle(config, vehicle, fleet, text, record=record, stop_fd=stop_fd))
 
 
 @app.command()

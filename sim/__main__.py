@@ -56,6 +56,9 @@ def up(
         Path | None, typer.Option(help="Faults of the stubs: a TOML file with tables [[fault]].")
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder for the flight's folder.")] = Path("flights"),
+    allow_missing: Annotated[
+        bool, typer.Option("--allow-missing", help="Fly without the vehicles that have not come after 15 s.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Only summary.json on standard output.")] = False,
 ) -> None:
     """Start stub autopilots and companions, take off, form, fly the plan, land, and sum up.
@@ -68,7 +71,7 @@ def up(
     from sim.launch.faults import load_scenario
     from sim.launch.launch import FlightOptions, flight_folder, fly
     from sim.launch.lock import only_flight, refuse_companions
-    from sim.launch.sitl import check_build, parse_parameters
+    from sim.launch.px4_instance import check_build, parse_parameters
     from sim.launch.view import FlightView, show_summary
 
     if autopilot not in ("stub", "px4", "external"):
@@ -108,10 +111,11 @@ def up(
     with only_flight(config.fleet.name):
         refuse_companions(config)
         options = FlightOptions(
-            flight_folder(out), seed, duration, px4, tuple(parameter or ()), autopilot == "external", gcs, faults
-        )
+            flight_folder(out), seed, duration, px4, tuple(parameter or ()), autopilot == "external", gcs, faults,
+            allow_missing,
+        )  # fmt: skip
         with FlightView(quiet=as_json) as view:
-            summary = fly(tables, options, view.show, interrupted)
+            summary = fly(tables, options, view.show, interrupted, lambda line: typer.echo(line, err=True))
     if as_json:
         typer.echo(json.dumps(summary))
     else:
@@ -194,20 +198,13 @@ def sitl(
 ) -> None:
     """Run PX4 SITL instances until standard input closes: for launchers."""
     from companion.config.overrides import fleet_config
-    from sim.launch.sitl import SitlHost, SitlSettings, check_build, parse_parameters
+    from sim.launch.px4_instance import check_build, parse_parameters
+    from sim.launch.sitl import SitlHost, SitlSettings
 
     config = fleet_config(fleet)
     parameters = parse_parameters(parameter or ())
     settings = SitlSettings(check_build(px4), truth.parent, truth, sys.stdin.fileno(), parameters, ready)
     SitlHost(config, settings).run(grace_s=1.5)
-
-
-@app.command(hidden=True)
-def reference_loop(out: Annotated[Path, typer.Option()]) -> None:
-    """An empty 50 Hz loop, to measure the machine beside a flight; ends when standard input closes."""
-    from sim.launch.reference_loop import run_reference_loop
-
-    run_reference_loop(out, sys.stdin.fileno())
 
 
 @app.command()

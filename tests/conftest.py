@@ -6,21 +6,45 @@ whose tests share a flight stays together: its flight is flown once.
 """
 
 import os
+from typing import Any
 
 import pytest
 
-FLEETS = ("test_fleet_up.py",)
+FLEETS = ("test_fleet_up.py", "test_missing.py")
 """files of tests/process that fly whole fleets: half of the time of all"""
 TOGETHER = ("test_flight.py", "test_faults.py", "test_damaged_recordings.py")
 """files of tests/lockstep whose tests look at flights that they share"""
+COMPILED = ("test_swarm.py", "test_swarm_lockstep.py", "test_study.py")
+"""files of tests/unit that compile the swarm: once for all of them"""
 LANES = 2
 NICENESS = 10
+
+
+def lane(nodeid: str) -> str:
+    """What is run by one worker, one test after another: tests of one lane, else each test by itself."""
+    folder, name = nodeid.split("::", maxsplit=1)[0].split("/")[-2:]
+    if folder in ("process", "sitl"):
+        return "fleets" if folder == "sitl" or name in FLEETS else "processes"
+    if folder == "lockstep" and name in TOGETHER:
+        return name
+    return "compiled" if name in COMPILED else nodeid
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
     """One worker more than there are cores, since the lanes mostly wait."""
     return max((os.cpu_count() or 1) + 1, LANES)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    from xdist.scheduler import LoadScopeScheduling
+
+    class Lanes(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            return lane(nodeid)
+
+    return Lanes(config, log)
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -31,17 +55,10 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    first, then = [], []
-    for item in items:
-        folder, name = item.path.parent.name, item.path.name
-        real_time = folder in ("process", "sitl")
-        if real_time:
-            lane = "fleets" if folder == "sitl" or name in FLEETS else "processes"
-            item.add_marker(pytest.mark.xdist_group(lane))
-        elif folder == "lockstep" and name in TOGETHER:
-            item.add_marker(pytest.mark.xdist_group(name))
-        (first if real_time else then).append(item)
-    # Groups are dealt out in the order of the tests: the lanes first, next what is longest of the rest.
-    first.sort(key=lambda item: item.path.name in FLEETS, reverse=True)
-    then.sort(key=lambda item: item.path.parent.name != "lockstep")
-    items[:] = first + then
+    # Lanes are dealt out in the order of the tests: what keeps real time first, next what is longest of the rest.
+    items.sort(key=lambda item: _turn(lane(item.nodeid), item.path.parent.name))
+
+
+def _turn(of: str, folder: str) -> int:
+    order = ("fleets", "processes", "compiled")
+    return order.index(of) if of in order else 3 if folder == "lockstep" else 4

@@ -7,6 +7,7 @@ from typing import Any
 from companion.config.derived import FleetConfig
 from companion.config.file import parse, read_tables
 from companion.errors import ConfigError
+from companion.shipped import FLEET_FILE, shipped
 
 DEFAULT_FILE = Path("fleet.toml")
 LEG_FORM = "hold:S, velocity:N:E:S, turn:DEG_S[:DEG], goto:N:E[:M_S] or none"
@@ -40,8 +41,7 @@ def fleet_config(path: Path, vehicles: int | None = None) -> FleetConfig:
 
 def existing_file(path: Path) -> Path:
     """fleet.toml of this folder, or the one beside the packages when this folder has none."""
-    shipped = Path(__file__).resolve().parents[2] / "fleet.toml"
-    return shipped if path == DEFAULT_FILE and not path.exists() and shipped.exists() else path
+    return shipped(FLEET_FILE) if path == DEFAULT_FILE and not path.exists() else path
 
 
 def resize(tables: dict[str, Any], count: int) -> None:

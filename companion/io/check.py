@@ -19,8 +19,7 @@ from companion.config.derived import Vehicle
 from companion.errors import CompanionError
 from companion.io.clock import FleetClock
 from companion.io.link import Link, open_link
-from companion.io.loop import network_settings
-from companion.io.zenoh_peers import OperatorLink
+from companion.io.network import operator_link
 from companion.vehicle.autopilot.adapters import open_autopilot
 from companion.vehicle.autopilot.port import AutopilotPort
 from companion.vehicle.preflight import own_checks
@@ -123,7 +122,7 @@ def _network(config: FleetConfig, vehicle: Vehicle) -> Iterator[Check]:
             f"cannot listen on {vehicle.zenoh}: {fault}",
         )  # fmt: skip
     try:
-        with OperatorLink(network_settings(config, None)) as link:
+        with operator_link(config) as link:
             others = {v.id for v in config.vehicles} - {vehicle.id}
             seen = sorted(link.wait_alive(others, 2.0))
     except CompanionError as error:

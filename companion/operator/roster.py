@@ -17,7 +17,7 @@ UP_TOGETHER_S = 30.0
 
 
 class Link(Protocol):
-    """How questions reach the vehicles (`io.zenoh_peers.OperatorLink`)."""
+    """How questions reach the vehicles (`io.transport.OperatorLink`)."""
 
     def ask(
         self, vehicle_ids: Iterable[int], kind: str, payload: bytes, timeout_s: float, retry_s: float

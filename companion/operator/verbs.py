@@ -34,21 +34,31 @@ FLEET_TOML = Path("fleet.toml")
 
 
 def mount(app: typer.Typer) -> None:
-    """Add every verb to a command."""
+    """Add every verb to a command, and `init`."""
+    app.command()(init)
     for verb in (status, preflight, takeoff, land, rtl, hold, form, move, release, resume, kill):
         app.command(rich_help_panel=PANEL)(verb)
+
+
+def init(
+    folder: Annotated[Path, typer.Argument(help="Where the files go.")] = Path(),
+) -> None:
+    """Write the shipped fleet.toml and the companion's systemd unit, to be edited. Overwrites nothing."""
+    from companion.shipped import write_shipped
+
+    for path in write_shipped(folder):
+        typer.echo(f"written: {path}")
 
 
 @contextmanager
 def connected(fleet: Path, vehicles: int | None, *, both: bool = False) -> "Iterator[Operator]":
     """An operator whose network is open."""
     from companion.config.overrides import fleet_config
-    from companion.io.loop import network_settings
-    from companion.io.zenoh_peers import OperatorLink
+    from companion.io.network import operator_link
     from companion.operator.client import Operator
 
     config = fleet_config(fleet, vehicles)
-    with OperatorLink(network_settings(config, None)) as link:
+    with operator_link(config) as link:
         operator = Operator(config, link, both=both)
         link.wait_alive(operator.ids, FOUND_WITHIN_S)
         yield operator

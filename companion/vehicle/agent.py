@@ -35,7 +35,7 @@ from companion.core.values import (
 from companion.errors import WireError
 from companion.vehicle import operator_port, plan_exchange
 from companion.vehicle.autopilot.adapters import open_autopilot
-from companion.vehicle.autopilot.port import Heard
+from companion.vehicle.autopilot.port import AutopilotPort, Heard
 from companion.vehicle.guest import GUESTS, law_of, trigger_of
 from companion.vehicle.observer import StateObserver
 from companion.vehicle.operator_port import Activity, OperatorPort
@@ -75,7 +75,7 @@ class Agent:
         self.rejected = Counts(REJECTED)
         others = frozenset(v.id for v in config.vehicles) - {vehicle_id}
         random = Random(vehicle_id << 32 | boot_id)
-        self.autopilot = open_autopilot(config, self.vehicle)
+        self.autopilot: AutopilotPort = open_autopilot(config, self.vehicle)
         self.history = TrajectoryHistory([config.first_motion])
         self.peers = PeerTable(vehicle_id, others, config.peer_limits, self.history)
         self.law = law_of(config, self.rejected)

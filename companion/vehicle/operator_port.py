@@ -185,7 +185,7 @@ class OperatorPort:
     # -- status --------------------------------------------------------------------------------------------------------
 
     def status(self, activity: Activity, now: Instant) -> Status:
-        """This vehicle's account of itself, but for what only its process knows."""
+        """The vehicle's account of itself, but for what only its process knows."""
         tick = activity.tick
         unready, newest = unmet(self.checks(now)), self.history.newest
         rejected = self.rejected + self.supervisor.counts + self.peers.rejected

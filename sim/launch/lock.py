@@ -9,8 +9,7 @@ from pathlib import Path
 
 from companion.config import FleetConfig
 from companion.errors import CompanionError
-from companion.io.loop import network_settings
-from companion.io.zenoh_peers import OperatorLink
+from companion.io.network import operator_link
 
 LOOK_S = 0.3
 """how long companions that run are looked for: on a machine's loopback they are found while the session opens"""
@@ -47,7 +46,7 @@ def only_flight(fleet_name: str, folder: Path | None = None) -> Iterator[None]:
 
 def refuse_companions(config: FleetConfig) -> None:
     """CompanionError if companions of this fleet run already, whoever started them."""
-    with OperatorLink(network_settings(config, None)) as link:
+    with operator_link(config) as link:
         there = link.wait_alive({v.id for v in config.vehicles}, LOOK_S)
     if there:
         raise CompanionError(

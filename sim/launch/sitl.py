@@ -5,20 +5,16 @@ PX4 takes instance numbers: instance i has system id i + 1 and speaks to UDP 145
 as HIL_STATE_QUATERNION on 19410 + i, the state of arming and mode from the ground station's link on 14550.
 """
 
-import json
 import os
-import re
 import select
 import signal
 import socket
 import struct
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import dataclass
-from math import hypot, isfinite
+from math import hypot
 from pathlib import Path
 from typing import Any
 
@@ -27,13 +23,14 @@ from pymavlink.dialects.v20 import development as mavlink
 
 from companion.config import FleetConfig
 from companion.config.derived import Vehicle
-from companion.config.endpoints import autopilot_port, companion_port
 from companion.core.frames import Geodetic, Ned, geodetic_to_ned, ned_to_geodetic
-from companion.errors import CompanionError, ConfigError
+from companion.errors import CompanionError
 from companion.io.link import SO_TIMESTAMPNS, received_unix_ns
 from companion.vehicle.autopilot.px4_versions import same_setting
 from companion.wire.px4 import interval_parameters, parameter_value
 from sim.autopilot.stubs import TRUTH_DTYPE
+from sim.launch.ended import tell_ended
+from sim.launch.px4_instance import FLEET_PARAMETERS, SIMULATOR_PARAMETERS, Px4Instance
 
 GCS_PORT = 14550
 GCS_PORT_OF_INSTANCE = 18570
@@ -41,7 +38,6 @@ TRUTH_PORT = 19410
 PX4_PORTS = 10
 """instances for which PX4's own scripts open an offboard link of their own"""
 STARTUP_TIMEOUT_S = 30.0
-END_TIMEOUT_S = 6.0
 FLUSH_INTERVAL_NS = 500_000_000
 RECEIVE_BUFFER_BYTES = 1 << 20
 CURRENT_MODE = 436
@@ -49,26 +45,7 @@ STATE_MESSAGES = frozenset({0, 22, 30, 77, 245, CURRENT_MODE})
 """HEARTBEAT, PARAM_VALUE, ATTITUDE, COMMAND_ACK, EXTENDED_SYS_STATE and CURRENT_MODE"""
 TRUTH_MESSAGES = frozenset({115})
 """HIL_STATE_QUATERNION"""
-ENDED_FILE = "autopilots-ended.jsonl"
-"""in the flight's folder: a line [vehicle id, how] for each autopilot that has ended in flight"""
 MODE_RATE_HZ = 20.0
-SIH_QUADROTOR = 10040
-FLEET_PARAMETERS: Mapping[str, float | int] = {
-    "COM_OBL_RC_ACT": 4,
-    "COM_RC_OVERRIDE": 3,
-    "MAN_OVERRIDE_SPD": 1.0,
-    "COM_RC_IN_MODE": 4,
-    "NAV_RCL_ACT": 0,
-    "NAV_DLL_ACT": 0,
-    "COM_RCL_EXCEPT": 4,
-    "SDLOG_MODE": -1,
-}
-"""a fleet without RC: land when the setpoints end; no stick input; no log on disk. Of `px4_versions.RENAMED` a
-version has one"""
-SIMULATOR_PARAMETERS: Mapping[str, float | int] = {"EKF2_ACC_NOISE": 0.6, "EKF2_GYR_NOISE": 0.1}
-"""what SIH's sensors are like: in flight their white noise is 0.5, 1.7 and 1.4 m/s^2 and 0.14, 0.07 and 0.03 rad/s a
-sample, of which the estimator's defaults (0.35 and 0.015) know nothing, so that it wanders by half a metre (see
-docs/px4.md)"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,117 +63,6 @@ class SitlSettings:
     ready_path: Path | None = None
     """a file that is made once every parameter was read back as set"""
     log: Callable[[str], None] = print
-
-
-def parse_parameters(texts: Sequence[str]) -> dict[str, float | int]:
-    """PX4 parameters from the command line, NAME=VALUE each."""
-    parameters: dict[str, float | int] = {}
-    for text in texts:
-        name, _, value = text.partition("=")
-        try:
-            if not re.fullmatch("[A-Z][A-Z0-9_]{0,15}", name):
-                raise ValueError(name)
-            number = float(value)
-            if not isfinite(number):
-                raise ValueError(value)
-        except ValueError:
-            raise ConfigError(f"--parameter must be NAME=VALUE, a PX4 parameter and a number, got {text!r}") from None
-        parameters[name] = int(number) if number.is_integer() else number
-    return parameters
-
-
-def check_build(build: Path) -> Path:
-    """The build folder, or CompanionError that says what it needs to hold."""
-    if not (build / "bin" / "px4").is_file() or not (build / "etc").is_dir():
-        raise CompanionError(
-            f"--px4 {build}: is no PX4 build folder (needs bin/px4 and etc/). Get PX4-Autopilot v1.16 from its "
-            "project, run `make px4_sitl_default` there and pass build/px4_sitl_default"
-        )
-    return build.resolve()
-
-
-class Px4Instance:
-    """One running PX4 process. Instance i has system id i + 1 and links as PX4's scripts open them.
-
-    It gets SIGTERM when whoever started it dies, however that may be.
-    """
-
-    def __init__(self, index: int, home: Geodetic, build: Path, folder: Path, parameters: Mapping[str, float | int]):
-        folder = folder.resolve()  # PX4 changes its folder before it reads this
-        folder.mkdir(parents=True)
-        environment = {
-            **{k: v for k, v in os.environ.items() if not k.startswith("PX4_")},
-            "PX4_SIM_MODEL": "sihsim_quadx",
-            "PX4_SYS_AUTOSTART": str(SIH_QUADROTOR),
-            "PX4_HOME_LAT": f"{home.latitude_deg:.9f}",
-            "PX4_HOME_LON": f"{home.longitude_deg:.9f}",
-            "PX4_HOME_ALT": f"{home.altitude_amsl_m:.3f}",
-            **{f"PX4_PARAM_{name}": str(value) for name, value in parameters.items()},
-        }
-        self.index = index
-        self.system_id = index + 1
-        self.parameters = parameters
-        self.build = build
-        with (folder / "px4.log").open("wb") as log:
-            self.process = subprocess.Popen(
-                [sys.executable, "-I", "-S", "-c", _END_WITH_PARENT, str(build / "bin" / "px4"), "-i", str(index),
-                 "-d", str(build / "etc"), "-w", str(folder)],
-                cwd=folder, env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT,
-                start_new_session=True,
-            )  # fmt: skip
-
-    def open_offboard_link(self) -> None:
-        """Past ten instances: a link of its own, since PX4's scripts would send all to one port."""
-        command = (
-            "start", "-x", "-u", str(autopilot_port(self.index)), "-r", "4000000", "-f", "-m", "onboard",
-            "-o", str(companion_port(self.index)),
-        )  # fmt: skip
-        done = subprocess.run(
-            [str(self.build / "bin" / "px4-mavlink"), "--instance", str(self.index), *command],
-            check=False, capture_output=True, text=True, timeout=10,
-        )  # fmt: skip
-        if done.returncode != 0:
-            said = f"{done.stdout}{done.stderr}".strip()
-            raise CompanionError(f"PX4 instance {self.index} opens no link on {autopilot_port(self.index)}: {said}")
-
-    def ask_to_end(self) -> None:
-        """SIGTERM, from which PX4 ends in about two seconds."""
-        if self.process.poll() is None:
-            self.process.send_signal(signal.SIGTERM)
-
-    def end(self) -> None:
-        """End it, with SIGKILL if need be, and wait until it is gone."""
-        self.ask_to_end()
-        try:
-            self.process.wait(END_TIMEOUT_S)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
-        Path(f"/tmp/px4-sock-{self.index}").unlink(missing_ok=True)
-
-
-_END_WITH_PARENT = f"""
-import ctypes, os, sys
-ctypes.CDLL(None).prctl(1, {int(signal.SIGTERM)})
-os.execv(sys.argv[1], sys.argv[1:])
-"""
-"""PR_SET_PDEATHSIG lasts through exec; set in an interpreter of its own, since forking a process with threads to run
-Python in it may hang"""
-
-
-def tell_ended(folder: Path, vehicle_id: int, how: str) -> None:
-    """Leave word for the launcher that a vehicle's autopilot has ended."""
-    with suppress(OSError), (folder / ENDED_FILE).open("a", encoding="utf-8") as file:
-        file.write(json.dumps([vehicle_id, how]) + "\n")
-
-
-def read_ended(folder: Path) -> dict[int, str]:
-    """Vehicle -> how its autopilot has ended, as told so far."""
-    try:
-        lines = (folder / ENDED_FILE).read_text(encoding="utf-8").splitlines(keepends=True)
-    except OSError:
-        return {}
-    return dict(json.loads(line) for line in lines if line.endswith("\n"))
 
 
 class _Instance:
@@ -358,7 +224,9 @@ class SitlHost:
                 case mavlink.MAVLink_extended_sys_state_message():
                     instance.landed_state = message.landed_state
                 case mavlink.MAVLink_param_value_message():
-                    instance.checked[message.param_id.rstrip("\x00")] = _value_of(message)
+                    instance.checked[message.param_id.rstrip("\x00")] = parameter_value(
+                        struct.pack("<f", message.param_value), message.param_type
+                    )
 
     def _read_truth(self, instance: _Instance) -> None:
         rows = []
@@ -430,10 +298,3 @@ def _other_name_set(instance: _Instance, name: str) -> bool:
     """Whether another version's name of the same setting was read back as set."""
     others = (n for n in same_setting(name) if n != name and n in instance.parameters)
     return name not in instance.checked and any(_as_set(instance, n, instance.parameters[n]) for n in others)
-
-
-__all__ = ["FLEET_PARAMETERS", "Px4Instance", "SitlHost", "SitlSettings", "check_build"]
-
-
-def _value_of(message: Any) -> float | int:
-    return parameter_value(struct.pack("<f", message.param_value), message.param_type)

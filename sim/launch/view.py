@@ -10,7 +10,8 @@ from rich.table import Table
 from rich.text import Text
 
 from companion.operator.views import Vehicles, one_line, phases, status_table
-from sim.launch.launch import Progress
+from sim.launch.processes import how_it_ended
+from sim.launch.watch import Progress
 
 PLAIN_INTERVAL_S = 5.0
 
@@ -57,7 +58,7 @@ class FlightView:
                     self._sent[i] = (progress.elapsed_s, sent)
         fleet = progress.vehicles
         head = f"{progress.elapsed_s:6.1f} s  {progress.doing}: {phases(fleet)}{_nearest(fleet)}"
-        ended = [f"companion {i} (status {s})" for i, s in sorted(progress.ended.items())]
+        ended = [f"companion {i}, {how_it_ended(s)}" for i, s in sorted(progress.ended.items())]
         ended += [f"vehicle {i}: {how}" for i, how in sorted(progress.autopilots_ended.items())]
         ended += [f"vehicle {i}: {one_line(s.killed)}" for i, s in sorted(fleet.items()) if s and s.killed]
         lines = [head, *([f"ended: {', '.join(ended)}"] if ended else [])]
@@ -96,6 +97,7 @@ def show_summary(summary: Mapping[str, Any]) -> None:
         ("CPU a tick", _unit(summary["cpu_per_tick_ms"], "ms")),
         ("longest setpoint gap", _unit(summary["setpoint_gap_max_s"], "s")),
         ("fastest touchdown", _unit(summary["touchdown_max_m_s"], "m/s")),
+        ("flown without", _of_vehicles(summary.get("missing", {}))),
         ("killed", _of_vehicles(summary["killed"])),
         ("failsafes", "; ".join(summary["failsafes"]) or "none"),
         ("not recorded", _of_vehicles(summary["unrecorded"])),

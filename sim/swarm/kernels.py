@@ -1,9 +1,9 @@
 """The swarm's step: measure, filter, exchange, command, move. Imported only once numba is wanted.
 
 Law, safety filter, prediction, triggers and gates are those of `companion.core`, compiled as they are
-(`sim.swarm.compiled`, `sim.swarm.rows`); the network is in `sim.swarm.exchange`. Arrays say their shape in `State`; N
-agents, R rows (a row is what one receiver holds of one sender: R = N while nothing is lost or late, else one for each
-ordered pair).
+(`sim.swarm.compiled`, `sim.swarm.rows`); the network is in `sim.swarm.exchange`. Arrays say their
+shape in `State`; N agents, R rows (a row is what one receiver holds of one sender: R = N while nothing is lost or late,
+else one for each ordered pair).
 
 What flies besides in a vehicle, and is left out here: the fence, the limits on jerk and speed, the altitude with its
 own loop and limits (the law acts in all three dimensions here), the bias observer, near mode, what a peer does on the

@@ -19,7 +19,7 @@ from companion.core.values import Instant
 from companion.io.recorder import Recorder, RecordingError, read_recording
 from companion.io.replay import ReplayResult, replay_file
 from sim.autopilot.stubs import TRUTH_DTYPE
-from sim.launch.summary import Flight
+from sim.launch.summary.flight import Flight
 
 FILES = 320
 FILES_LONG = 5000

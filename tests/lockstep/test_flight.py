@@ -29,7 +29,8 @@ from companion.io.replay import replay
 from companion.vehicle.agent import Agent
 from companion.wire.operator import Status, decode, encode
 from companion.wire.peer import decode_motion, encode_motion
-from sim.launch.summary import Flight, Put, summarise
+from sim.launch.summary.flight import Flight, Put
+from sim.launch.summary.summarise import summarise
 from sim.lockstep.lockstep import UTC_AT_START_NS, Lockstep
 from sim.lockstep.network import NetworkParameters
 

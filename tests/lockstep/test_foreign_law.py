@@ -61,7 +61,7 @@ def test_a_foreign_law_and_trigger_take_a_lossy_fleet_into_formation_along_the_p
     gaps = [np.linalg.norm(rows[:, i] - rows[:, j], axis=1).min() for i in range(COUNT) for j in range(i)]
     assert min(gaps) > 1.0
     assert not any(a.rejected[LAW_RAISED] + a.rejected[LAW_NOT_FINITE] + a.rejected[TRIGGER_RAISED] for a in agents)
-    assert sum(a.sent_because["triggered"] for a in agents) > 0
+    assert sum(a.publisher.sent_because["triggered"] for a in agents) > 0
 
 
 @pytest.mark.usefixtures("springs")

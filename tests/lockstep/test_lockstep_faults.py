@@ -61,5 +61,5 @@ def test_a_second_companion_of_one_id_speaks_and_the_first_hears_that_it_does() 
     twin = ls.add_twin(1)
     wait(ls, 3.0)
     assert twin.boot_id != boot_id
-    assert twin.messages_sent > 0
-    assert ls.own_id_heard[1] >= twin.messages_sent
+    assert twin.publisher.messages_sent > 0
+    assert ls.own_id_heard[1] >= twin.publisher.messages_sent

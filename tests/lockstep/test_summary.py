@@ -22,7 +22,8 @@ from companion.core.values import Phase
 from companion.wire.peer import encode_motion
 from companion.wire.px4 import Px4Mode
 from sim.autopilot.faults import Fault, FaultKind
-from sim.launch.summary import Flight, summarise
+from sim.launch.summary.flight import Flight
+from sim.launch.summary.summarise import summarise
 from sim.lockstep.lockstep import UTC_AT_START_NS, Lockstep
 
 ON_GROUND = 1

@@ -127,7 +127,7 @@ def _others(value: object) -> list[object]:
     if isinstance(value, int):
         return [value - 1, value + 1]
     if isinstance(value, float):
-        return [round(0.9 * value, 12), round(1.1 * value, 12)] if value else [-1.0, 1.0]
+        return [float(f"{0.9 * value:.9g}"), float(f"{1.1 * value:.9g}")] if value else [-1.0, 1.0]
     return [f"XX{value}XX"] if isinstance(value, str) else []
 
 

@@ -22,8 +22,8 @@ import numpy.typing as npt
 import tomli_w
 
 from companion.config import FleetConfig, load
-from companion.io.loop import network_settings
-from companion.io.zenoh_peers import OperatorLink, scouting_port
+from companion.io.network import operator_link
+from companion.io.zenoh.configuration import scouting_port
 from companion.operator.client import Operator
 from companion.wire.operator import Status, decode
 from sim.autopilot.stubs import TRUTH_DTYPE
@@ -143,7 +143,7 @@ def run(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
 @contextmanager
 def operator_of(fleet: Fleet) -> Iterator[Operator]:
     """An operator in this process, for waiting; what is tested goes through the command line."""
-    with OperatorLink(network_settings(fleet.config, None)) as link:
+    with operator_link(fleet.config) as link:
         yield Operator(fleet.config, link)
 
 

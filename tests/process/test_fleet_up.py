@@ -53,10 +53,10 @@ from companion.core.frames import Ned
 from companion.core.values import PeerMessage, PeerSample, Phase
 from companion.io.recorder import read_recording
 from companion.io.replay import replay_file
-from companion.io.zenoh_peers import (
+from companion.io.zenoh.configuration import (
     PLANS_HZ,
     REQUESTS_HZ,
-    PeerNetworkSettings,
+    SessionSettings,
     scouting_port,
     zenoh_configuration,
 )
@@ -137,7 +137,7 @@ class Flown:
 
 def put_garbage(fleet: Fleet) -> None:
     """Peers' payloads that no vehicle may take, through a session of the fleet's own namespace."""
-    settings = PeerNetworkSettings(fleet.config.fleet.name, None, scouting_port=fleet.config.peers.scouting_port)
+    settings = SessionSettings(fleet.config.fleet.name, None, scouting_port=fleet.config.peers.scouting_port)
 
     def state(vehicle_id: int, ahead_s: float = 0.0) -> bytes:
         at_ns = time.time_ns() + round(ahead_s * 1e9)
@@ -358,8 +358,8 @@ class Loss:
 
 @pytest.fixture(scope="module")
 def loss(tmp_path_factory: pytest.TempPathFactory) -> Loss:
-    """Formed and moving; companion 2 dies, companion 3 can write no more, the companions' file is edited, the launcher
-    is interrupted."""
+    """Formed and moving; the companions' server and companion 2 die, companion 3 can write no more, the file is edited,
+    the launcher is interrupted."""
     fleet = make_fleet(tmp_path_factory.mktemp("loss"), 4)
     loss = Loss(fleet)
     out = fleet.folder / "flights"
@@ -368,6 +368,7 @@ def loss(tmp_path_factory: pytest.TempPathFactory) -> Loss:
         wait_status(operator, all_in(fleet.ids, *SETTLED, revision=2))
         loss.folder = flight_folder(out)
         resource.prlimit(child(up.popen.pid, "run --vehicle 3 "), resource.RLIMIT_FSIZE, (0, 0))
+        os.kill(child(up.popen.pid, "companions' server"), signal.SIGKILL)
         os.kill(child(up.popen.pid, "run --vehicle 2 "), signal.SIGKILL)
         loss.killed_ns = time.time_ns()
         with (loss.folder / "fleet.toml").open("a") as file:
@@ -404,7 +405,7 @@ def test_a_lost_companion_fails_the_flight_and_is_named(loss: Loss) -> None:
     assert loss.summary["lost"] == [2]
     assert loss.summary["passed"] is False
     assert "companions lost" in loss.out
-    assert "ended: companion 2" in loss.err
+    assert "ended: companion 2, status -9 (SIGKILL)" in loss.err
     assert loss.summary["exit_status"] == {"1": 0, "2": -signal.SIGKILL, "3": 0, "4": 0}
 
 
@@ -478,7 +479,7 @@ def test_no_child_outlives_a_launcher_killed_in_flight_and_the_vehicles_are_land
         with operator_of(fleet) as operator:
             wait_status(operator, all_in(fleet.ids, "waiting", "forming"))
         pids = list(children(up.popen.pid).values())
-        assert len(pids) == 2 + len(fleet.ids)
+        assert len(pids) == 3 + len(fleet.ids)
         up.signal(signal.SIGKILL)
         assert eventually(lambda: not still_there(pids), 2.0), still_there(pids)
     assert ports_free(fleet)
@@ -490,7 +491,7 @@ def test_no_child_outlives_a_launcher_killed_in_flight_and_the_vehicles_are_land
 def test_no_child_outlives_a_launcher_killed_while_they_start(tmp_path: Path) -> None:
     fleet = make_fleet(tmp_path, 1)
     with started("sim", "up", "--fleet", str(fleet.file), "--out", str(tmp_path / "o"), folder=tmp_path) as up:
-        assert eventually(lambda: len(children(up.popen.pid)) == 2 + len(fleet.ids))
+        assert eventually(lambda: len(children(up.popen.pid)) == 3 + len(fleet.ids))
         pids = list(children(up.popen.pid).values())
         up.signal(signal.SIGKILL)
         up.wait()

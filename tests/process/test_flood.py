@@ -9,7 +9,7 @@ loop by itself is known from it, and from an empty loop of 50 Hz that runs besid
 import os
 import sys
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -20,10 +20,10 @@ from fleet_process import wait_status as wait_for
 from fuzz_inputs import Inputs
 
 from companion.core.trajectory.fleet import FleetTrajectory
-from companion.io.loop import TICK_RECORD, network_settings
 from companion.io.recorder import read_recording
+from companion.io.records import TickRecord
 from companion.io.replay import replay_file
-from companion.io.zenoh_peers import zenoh_configuration
+from companion.io.zenoh.configuration import session_settings, zenoh_configuration
 from companion.operator.client import Operator
 from companion.wire.peer import motion_from_json
 from companion.wire.px4 import Px4Mode
@@ -63,7 +63,7 @@ def newest_of(operator: Operator) -> FleetTrajectory:
 def flood(fleet: Fleet, operator: Operator) -> int:
     """INPUTS inputs at RATE_HZ, puts to all and questions to one; how many."""
     inputs, given = Inputs(fleet.config, seed=2), 0
-    session = zenoh.open(zenoh_configuration(replace(network_settings(fleet.config, None))))
+    session = zenoh.open(zenoh_configuration(session_settings(fleet.config, None)))
     try:
         assert eventually(lambda: len(session.info.peers_zid()) >= len(fleet.ids))
         newest, next_s = newest_of(operator), time.monotonic()
@@ -119,7 +119,7 @@ def flown(folder: Path, flooded: bool) -> Seen:
         entries = list(read_recording(seen / f"vehicle-{i}.mcap").entries)
         turns = [e.instant.fleet_ns for e in entries if e.channel == "advance"]
         spent = [
-            TICK_RECORD.unpack(e.body)[2]
+            TickRecord.unpack(e.body).cpu_ns
             for e in entries
             if e.channel == "tick" and begin_ns <= e.instant.fleet_ns <= end_ns
         ]

@@ -15,9 +15,9 @@ import zenoh
 from fleet_process import SETTLED, all_in, eventually, flight_folder, make_fleet, operator_of, started, wait_status
 from zenoh.handlers import Callback
 
-from companion.io.loop import TICK_RECORD
 from companion.io.recorder import read_recording
-from companion.io.zenoh_peers import PeerNetworkSettings, zenoh_configuration
+from companion.io.records import TickRecord
+from companion.io.zenoh.configuration import SessionSettings, zenoh_configuration
 from sim.launch.reference_loop import read_reference_loop
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(400)]
@@ -47,7 +47,7 @@ class Flooded:
             ticks = [
                 e.instant.fleet_ns
                 for e in read_recording(self.folder / f"vehicle-{i}.mcap").entries
-                if e.channel == "tick" and TICK_RECORD.unpack(e.body)[5] and begin <= e.instant.fleet_ns <= end
+                if e.channel == "tick" and TickRecord.unpack(e.body).steered and begin <= e.instant.fleet_ns <= end
             ]
             longest = max(longest, float(np.diff(ticks).max()) * 1e-9)
         return longest
@@ -66,7 +66,7 @@ def flooded(tmp_path_factory: pytest.TempPathFactory) -> Flooded:
     flooded = Flooded()
     out = fleet.folder / "flights"
     arguments = ("sim", "up", "--json", "--fleet", str(fleet.file), "--out", str(out), "--plan", "velocity:0.5:0:3600")
-    settings = PeerNetworkSettings(fleet.config.fleet.name, None, scouting_port=fleet.config.peers.scouting_port)
+    settings = SessionSettings(fleet.config.fleet.name, None, scouting_port=fleet.config.peers.scouting_port)
     pause = threading.Event()
     with started(*arguments, folder=fleet.folder, name="up") as up, operator_of(fleet) as operator:
         wait_status(operator, all_in(fleet.ids, *SETTLED, revision=2))

@@ -6,7 +6,7 @@ import pytest
 from fleet_process import run
 
 from companion.errors import ConfigError
-from sim.launch.sitl import parse_parameters
+from sim.launch.px4_instance import parse_parameters
 
 pytestmark = pytest.mark.process
 

@@ -20,24 +20,19 @@ import zenoh
 from zenoh.handlers import Callback
 
 from companion.errors import ConfigError
-from companion.io.zenoh_peers import (
-    ASK_INTERVAL_S,
-    PAYLOAD_MAX_BYTES,
+from companion.io.mailbox import BOUNDS, Bound
+from companion.io.transport import PAYLOAD_MAX_BYTES, Event, PresenceChange, ReceivedSample, Request, TransportError
+from companion.io.zenoh.configuration import (
     PLANS_HZ,
     REQUESTS_HZ,
     STATE_MAX_BYTES,
-    Event,
-    OperatorLink,
-    PeerMessage,
-    PeerNetwork,
-    PeerNetworkError,
-    PeerNetworkSettings,
-    PresenceChange,
-    Request,
+    SessionSettings,
     mesh_endpoints,
     scouting_port,
     zenoh_configuration,
 )
+from companion.io.zenoh.operator import ASK_INTERVAL_S, ZenohOperatorLink
+from companion.io.zenoh.vehicle import ZenohTransport
 
 T = TypeVar("T")
 PATIENCE_S = 10.0
@@ -53,11 +48,11 @@ def fleet() -> str:
 
 
 class Vehicle:
-    """A PeerNetwork with a loop's mailbox."""
+    """A ZenohTransport with a loop's mailbox."""
 
-    def __init__(self, settings: PeerNetworkSettings, states_waiting: int = 4096) -> None:
+    def __init__(self, settings: SessionSettings, states_waiting: int = 4096) -> None:
         self._woken = threading.Event()
-        self.network = PeerNetwork(settings, self._woken.set, states_waiting=states_waiting)
+        self.network = ZenohTransport(settings, self._woken.set, BOUNDS | {"state": Bound(states_waiting, 256)})
         self.events: list[Event] = []
 
     def collect(self, enough: Callable[[list[Event]], bool], timeout_s: float = PATIENCE_S) -> bool:
@@ -72,7 +67,7 @@ class Vehicle:
                 return False
 
     def messages(self) -> list[tuple[str, bytes]]:
-        return [(event.key, event.payload) for event in self.events if isinstance(event, PeerMessage)]
+        return [(event.key, event.payload) for event in self.events if isinstance(event, ReceivedSample)]
 
     def presence(self) -> list[tuple[int, bool]]:
         return [(event.vehicle_id, event.alive) for event in self.events if isinstance(event, PresenceChange)]
@@ -89,7 +84,7 @@ class Vehicle:
 
 @contextmanager
 def vehicle(fleet: str, vehicle_id: int, states_waiting: int = 4096) -> Iterator[Vehicle]:
-    it = Vehicle(PeerNetworkSettings(fleet, vehicle_id), states_waiting)
+    it = Vehicle(SessionSettings(fleet, vehicle_id), states_waiting)
     with it.network:
         yield it
 
@@ -113,8 +108,9 @@ def paced(items: Iterable[T]) -> Iterator[T]:
 
 CHILD = """
 import sys
-from companion.io.zenoh_peers import PeerNetwork, PeerNetworkSettings
-network = PeerNetwork(PeerNetworkSettings(sys.argv[1], int(sys.argv[2])), lambda: None)
+from companion.io.zenoh.configuration import SessionSettings
+from companion.io.zenoh.vehicle import ZenohTransport
+network = ZenohTransport(SessionSettings(sys.argv[1], int(sys.argv[2])), lambda: None)
 network.open()
 network.publish("state", b"child")
 print("open", flush=True)
@@ -146,19 +142,19 @@ def child(fleet: str, vehicle_id: int, then: str) -> Iterator[subprocess.Popen[s
 @pytest.mark.parametrize("name", ["", "a/b", "a*", "*", "@fleet", "a$b", "-a", "a b", "a?b", "a#b", "x" * 65])
 def test_a_fleet_name_that_is_no_single_key_chunk_is_refused(name: str) -> None:
     with pytest.raises(ConfigError, match="fleet name"):
-        PeerNetworkSettings(name, 1)
+        SessionSettings(name, 1)
 
 
 @pytest.mark.parametrize("vehicle_id", [0, -1, 251])
 def test_a_vehicle_id_outside_its_range_is_refused(vehicle_id: int) -> None:
     with pytest.raises(ConfigError, match="vehicle id"):
-        PeerNetworkSettings("fleet", vehicle_id)
+        SessionSettings("fleet", vehicle_id)
 
 
 @pytest.mark.parametrize("port", [0, 1023, 65_536])
 def test_a_privileged_or_impossible_scouting_port_is_refused(port: int) -> None:
     with pytest.raises(ConfigError, match="scouting port"):
-        PeerNetworkSettings("fleet", 1, scouting_port=port)
+        SessionSettings("fleet", 1, scouting_port=port)
 
 
 @pytest.mark.parametrize(
@@ -166,31 +162,31 @@ def test_a_privileged_or_impossible_scouting_port_is_refused(port: int) -> None:
 )
 def test_a_laptop_refuses_endpoints_beyond_loopback(endpoint: str) -> None:
     with pytest.raises(ConfigError, match="loopback"):
-        PeerNetworkSettings("fleet", 1, listen=(endpoint,))
+        SessionSettings("fleet", 1, listen=(endpoint,))
     with pytest.raises(ConfigError, match="loopback"):
-        PeerNetworkSettings("fleet", 1, connect=(endpoint,))
+        SessionSettings("fleet", 1, connect=(endpoint,))
 
 
 @pytest.mark.parametrize(
     "endpoint", ["tcp/127.0.0.1:7447", "udp/127.0.0.9:1?rel=0", "tcp/[::1]:0", "tcp/localhost:1", "unixsock-stream/f"]
 )
 def test_a_laptop_accepts_endpoints_on_loopback(endpoint: str) -> None:
-    assert PeerNetworkSettings("fleet", 1, listen=(endpoint,)).listen == (endpoint,)
+    assert SessionSettings("fleet", 1, listen=(endpoint,)).listen == (endpoint,)
 
 
 def test_a_vehicle_in_the_field_needs_endpoints_to_listen_on_and_an_operator_does_not() -> None:
     with pytest.raises(ConfigError, match="listens on"):
-        PeerNetworkSettings("fleet", 1, profile="field", connect=mesh_endpoints("10.0.0.2"))
+        SessionSettings("fleet", 1, profile="field", connect=mesh_endpoints("10.0.0.2"))
     with pytest.raises(ConfigError, match="needs endpoints"):
-        PeerNetworkSettings("fleet", None, profile="field")
-    assert PeerNetworkSettings("fleet", None, profile="field", connect=mesh_endpoints("10.0.0.2")).connect
+        SessionSettings("fleet", None, profile="field")
+    assert SessionSettings("fleet", None, profile="field", connect=mesh_endpoints("10.0.0.2")).connect
 
 
 def test_a_network_belongs_to_a_vehicle_and_a_link_to_an_operator() -> None:
-    with pytest.raises(ValueError, match="OperatorLink"):
-        PeerNetwork(PeerNetworkSettings("fleet", None), lambda: None)
+    with pytest.raises(ValueError, match="ZenohOperatorLink"):
+        ZenohTransport(SessionSettings("fleet", None), lambda: None)
     with pytest.raises(ValueError, match="no vehicle id"):
-        OperatorLink(PeerNetworkSettings("fleet", 1))
+        ZenohOperatorLink(SessionSettings("fleet", 1))
 
 
 def test_the_scouting_port_depends_on_the_name_alone_and_avoids_mavlink_and_ephemeral_ports() -> None:
@@ -200,12 +196,12 @@ def test_the_scouting_port_depends_on_the_name_alone_and_avoids_mavlink_and_ephe
     assert all(20_000 <= port < 24_000 for port in ports)
 
 
-def read(settings: PeerNetworkSettings, key: str) -> object:
+def read(settings: SessionSettings, key: str) -> object:
     return json.loads(zenoh_configuration(settings).get_json(key))
 
 
 def test_a_laptop_scouts_on_loopback_only_under_the_fleets_name() -> None:
-    settings = PeerNetworkSettings("starling", 3)
+    settings = SessionSettings("starling", 3)
     assert read(settings, "namespace") == "starling"
     assert read(settings, "mode") == "peer"
     assert read(settings, "scouting/multicast/enabled") is True
@@ -216,13 +212,11 @@ def test_a_laptop_scouts_on_loopback_only_under_the_fleets_name() -> None:
     assert read(settings, "listen/endpoints") == ["tcp/127.0.0.1:0"]
     assert read(settings, "transport/shared_memory/enabled") is False
     assert read(settings, "timestamping/enabled") is True
-    assert (
-        read(PeerNetworkSettings("starling", 3, scouting_port=9999), "scouting/multicast/address") == "224.0.0.224:9999"
-    )
+    assert read(SessionSettings("starling", 3, scouting_port=9999), "scouting/multicast/address") == "224.0.0.224:9999"
 
 
 def test_the_field_listens_where_told_retries_forever_and_never_multicasts() -> None:
-    settings = PeerNetworkSettings(
+    settings = SessionSettings(
         "starling", 3, profile="field", listen=mesh_endpoints("10.0.0.3"), connect=mesh_endpoints("10.0.0.4")
     )
     assert read(settings, "listen/endpoints") == ["tcp/10.0.0.3:7447?rel=1", "udp/10.0.0.3:7447?rel=0"]
@@ -260,7 +254,7 @@ def test_what_a_vehicle_publishes_reaches_its_peers_and_not_itself(fleet: str) -
         one.wait_message("fleet/2/state", b"state of 2")
         assert one.messages() == [("fleet/2/state", b"state of 2")]
         assert one.presence() == [(2, True)]
-        assert all(e.received_monotonic_ns > sent_ns for e in two.events if isinstance(e, PeerMessage))
+        assert all(e.received_monotonic_ns > sent_ns for e in two.events if isinstance(e, ReceivedSample))
         counters = one.network.counters
         assert (counters.dropped, counters.malformed, counters.own_id_heard, counters.publish_failures) == (0, 0, 0, 0)
 
@@ -282,10 +276,10 @@ def test_a_late_joiner_gets_the_last_state_and_the_last_plan_of_everybody(fleet:
 @pytest.mark.process
 def test_two_fleets_of_different_names_on_one_port_do_not_hear_each_other(fleet: str) -> None:
     port = scouting_port(fleet)
-    mine = Vehicle(PeerNetworkSettings(fleet + "-a", 1, scouting_port=port))
-    friend = Vehicle(PeerNetworkSettings(fleet + "-a", 2, scouting_port=port))
-    stranger = Vehicle(PeerNetworkSettings(fleet + "-b", 3, scouting_port=port))
-    operator = OperatorLink(PeerNetworkSettings(fleet + "-a", None, scouting_port=port))
+    mine = Vehicle(SessionSettings(fleet + "-a", 1, scouting_port=port))
+    friend = Vehicle(SessionSettings(fleet + "-a", 2, scouting_port=port))
+    stranger = Vehicle(SessionSettings(fleet + "-b", 3, scouting_port=port))
+    operator = ZenohOperatorLink(SessionSettings(fleet + "-a", None, scouting_port=port))
     with mine.network, friend.network, stranger.network, operator:
         mine.wait_presence(2, True)
         stranger.network.publish("state", b"strange")
@@ -317,7 +311,7 @@ def test_endpoints_given_on_a_laptop_connect_without_scouting_and_in_any_order_o
 ) -> None:
     endpoints = [f"unixsock-stream/{tmp_path}/{number}" for number in (1, 2)]
     settings = [
-        PeerNetworkSettings(fleet, index + 1, listen=(endpoints[index],), connect=(endpoints[1 - index],))
+        SessionSettings(fleet, index + 1, listen=(endpoints[index],), connect=(endpoints[1 - index],))
         for index in (0, 1)
     ]
     assert read(settings[0], "scouting/multicast/enabled") is False
@@ -330,16 +324,16 @@ def test_endpoints_given_on_a_laptop_connect_without_scouting_and_in_any_order_o
 @pytest.mark.process
 def test_an_endpoint_in_use_is_an_error_with_a_sentence(fleet: str, tmp_path: Path) -> None:
     endpoint = f"unixsock-stream/{tmp_path}/1"
-    with Vehicle(PeerNetworkSettings(fleet, 1, listen=(endpoint,))).network:
-        again = PeerNetwork(PeerNetworkSettings(fleet, 2, listen=(endpoint,)), lambda: None)
-        with pytest.raises(PeerNetworkError, match=fleet):
+    with Vehicle(SessionSettings(fleet, 1, listen=(endpoint,))).network:
+        again = ZenohTransport(SessionSettings(fleet, 2, listen=(endpoint,)), lambda: None)
+        with pytest.raises(TransportError, match=fleet):
             again.open()
         again.close()
 
 
 @pytest.mark.process
 def test_foreign_keys_deletions_and_oversized_payloads_are_counted_and_not_delivered(fleet: str) -> None:
-    with vehicle(fleet, 1) as one, zenoh.open(zenoh_configuration(PeerNetworkSettings(fleet, None))) as stranger:
+    with vehicle(fleet, 1) as one, zenoh.open(zenoh_configuration(SessionSettings(fleet, None))) as stranger:
         block = zenoh.CongestionControl.BLOCK
         assert eventually(lambda: len(list(stranger.liveliness().get("fleet/1/alive"))) == 1)
         for name in ("abc", "0", "007", "251", "-2", "2.0", "1e1", "²"):
@@ -374,6 +368,7 @@ def test_somebody_else_speaking_under_our_id_is_counted_and_told_to_the_agent(fl
         double.network.publish("state", b"false")
         two.network.publish("state", b"true")
         one.wait_message("fleet/2/state", b"true")
+        one.wait_message("fleet/1/state", b"false")
         assert eventually(lambda: one.network.counters.own_id_heard == 1)
         assert sorted(one.messages()) == [("fleet/1/state", b"false"), ("fleet/2/state", b"true")]
 
@@ -384,7 +379,7 @@ def test_a_loop_that_does_not_drain_keeps_the_newest_messages_and_every_presence
         two.wait_presence(1, True)
         for number in range(12):
             two.network.publish("state", b"%d" % number)
-        assert eventually(lambda: one.network.dropped == 8)
+        assert eventually(lambda: one.network.counters.dropped == 8)
         one.wait_message("fleet/2/state", b"11")
         assert one.messages() == [("fleet/2/state", b"%d" % number) for number in range(8, 12)]
         assert one.presence() == [(2, True)]
@@ -396,7 +391,7 @@ def test_a_flood_of_one_session_is_thinned_before_it_is_heard_and_others_are_hea
     with (
         vehicle(fleet, 1) as one,
         vehicle(fleet, 2) as two,
-        zenoh.open(zenoh_configuration(PeerNetworkSettings(fleet, None))) as stranger,
+        zenoh.open(zenoh_configuration(SessionSettings(fleet, None))) as stranger,
     ):
         two.wait_presence(1, True)
         one.wait_presence(2, True)
@@ -427,7 +422,7 @@ def test_a_question_too_many_for_a_vehicle_is_one_that_an_operator_does_not_ask(
 def test_an_operators_questions_in_quick_succession_are_all_answered_without_a_retry(fleet: str) -> None:
     with (
         vehicle(fleet, 1) as one,
-        OperatorLink(PeerNetworkSettings(fleet, None)) as operator,
+        ZenohOperatorLink(SessionSettings(fleet, None)) as operator,
         answering(one, echo),
     ):
         assert operator.wait_alive([1], PATIENCE_S) == {1}
@@ -470,7 +465,7 @@ def test_an_operator_sees_who_is_alive_and_asks_all_at_once(fleet: str) -> None:
     with (
         vehicle(fleet, 1) as one,
         vehicle(fleet, 2) as two,
-        OperatorLink(PeerNetworkSettings(fleet, None)) as operator,
+        ZenohOperatorLink(SessionSettings(fleet, None)) as operator,
         answering(one, echo),
         answering(two, echo),
     ):
@@ -498,7 +493,7 @@ def test_a_silent_vehicle_is_asked_again_and_one_that_is_absent_is_reported_afte
 
     with (
         vehicle(fleet, 1) as one,
-        OperatorLink(PeerNetworkSettings(fleet, None)) as operator,
+        ZenohOperatorLink(SessionSettings(fleet, None)) as operator,
         answering(one, answer_the_third),
     ):
         begin_s = time.monotonic()
@@ -510,7 +505,7 @@ def test_a_silent_vehicle_is_asked_again_and_one_that_is_absent_is_reported_afte
 @pytest.mark.process
 def test_a_request_is_answered_once_and_an_answer_that_nobody_awaits_does_no_harm(fleet: str) -> None:
     with vehicle(fleet, 1) as one:
-        with OperatorLink(PeerNetworkSettings(fleet, None)) as operator:
+        with ZenohOperatorLink(SessionSettings(fleet, None)) as operator:
             assert operator.ask([1], "status", b"", timeout_s=0.1, retry_s=0.06) == {1: ()}
         assert one.collect(lambda _: len(one.requests()) == 2)
         after_the_operator_left, after_the_vehicle_left = one.requests()

@@ -10,6 +10,7 @@ from pathlib import Path
 from companion.config import load
 from companion.core.frames import Ned
 from companion.io.loop import Companion, RunSettings
+from companion.io.process import run_in_process
 from sim.study.broken_law import BrokenLaw
 
 
@@ -17,14 +18,14 @@ def main() -> int:
     file, vehicle_id, speed_m_s = Path(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3])
     config = load(file)
     companion = Companion(config, RunSettings(vehicle_id, stop_fd=sys.stdin.fileno()), {})
-    broken = companion.vehicle.agent.law = BrokenLaw(companion.vehicle.agent.law)
+    broken = companion.agent.law = BrokenLaw(companion.agent.law)
 
     def break_law(*_: object) -> None:
         broken.velocity_ned_m_s = Ned(speed_m_s, 0.0, 0.0)
 
     signal.signal(signal.SIGUSR1, break_law)
     try:
-        return companion.run()
+        return run_in_process(companion)
     finally:
         companion.close()
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sim.launch.sitl import check_build
+from sim.launch.px4_instance import check_build
 
 HERE = Path(__file__).parent
 for helpers in ("process", "wire"):

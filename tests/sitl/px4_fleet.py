@@ -21,7 +21,7 @@ from companion.io.recorder import read_recording
 from companion.operator.client import Operator
 from companion.wire.px4 import Px4Mode, mode_parameters
 from sim.autopilot.stubs import TRUTH_DTYPE
-from sim.launch.summary import Flight as PreflightReport
+from sim.launch.summary.flight import Flight as FlightRecord
 
 PATIENCE_S = 180.0
 ALTITUDE_M = 5.0
@@ -104,7 +104,7 @@ class Flying:
 
     def history(self) -> TrajectoryHistory:
         """The motions that the vehicles followed, from their recordings; after the flight's end."""
-        account = PreflightReport(self.fleet.config, seed=0, truth=np.zeros(0), takeoff_ns=0)
+        account = FlightRecord(self.fleet.config, seed=0, truth=np.zeros(0), takeoff_ns=0)
         for i in self.fleet.ids:
             account.read(i, read_recording(self.folder / f"vehicle-{i}.mcap").entries)
         return account.history()

@@ -12,7 +12,7 @@ from autopilot_flight import COMPANION_COMPONENT, VELOCITY_AND_YAW, mavlink
 
 from companion.core.frames import Geodetic
 from sim.autopilot.modes import MODE_OF_CUSTOM, Mode
-from sim.launch.sitl import Px4Instance
+from sim.launch.px4_instance import Px4Instance
 
 HOME = Geodetic(47.397742, 8.545594, 488.0)
 COMPANION_PORT, AUTOPILOT_PORT = 14540, 14580

@@ -14,7 +14,7 @@ from px4_fleet import flying, sitl_fleet
 from companion.core.frames import Ned, ned_to_geodetic
 from companion.io.recorder import read_recording
 from companion.wire.px4 import Px4Mode
-from sim.launch.sitl import Px4Instance
+from sim.launch.px4_instance import Px4Instance
 
 PLAN = {
     "then": "land",

@@ -183,6 +183,12 @@ def test_the_push_is_what_just_breaks_the_half_plane(distance_m: float, closing_
     assert kept is (push <= push_m_s2(plane)) or push == pytest.approx(push_m_s2(plane))
 
 
+def test_the_push_is_told_in_m_s2_whatever_the_half_planes_scale_and_direction() -> None:
+    """A gradient is shorter than 1 where the peer is above or below."""
+    assert push_m_s2(HalfPlane(0.3, -0.4, -1.0)) == pytest.approx(2.0)
+    assert push_m_s2(HalfPlane(0.0, 0.1, 0.3)) == pytest.approx(-3.0)
+
+
 def test_at_rest_a_pair_that_shares_the_avoidance_is_near_from_2_m_on_at_the_default_radius() -> None:
     radius_m = 0.65 + BOUND_M
     assert resting_push_m_s2(2.25, radius_m) < PUSH_M_S2 < resting_push_m_s2(2.3, radius_m)

@@ -289,6 +289,15 @@ def test_a_peer_out_of_reach_binds_no_command(
         assert plane.b <= -most * hypot(plane.g_north, plane.g_east) + 1e-9
 
 
+def test_the_filter_tells_the_half_planes_of_the_peers_within_reach_as_of_its_last_command() -> None:
+    f, ego = SafetyFilter(LIMITS), state()
+    near, far = peer(Ned(2.0, 0.0, 0.0)), peer(Ned(1000.0, 0.0, 0.0), vehicle_id=3)
+    applied(f, command(), ego, [near, far])
+    assert f.peer_planes == [half_plane(ego, ZERO, near)]
+    applied(f, command(), ego, [far])
+    assert f.peer_planes == []
+
+
 @pytest.mark.parametrize("shares", [True, False])
 @pytest.mark.parametrize("closing", [0.0, 2.0, 8.0])
 def test_the_reach_is_not_much_longer_than_it_must_be(shares: bool, closing: float) -> None:

@@ -14,8 +14,8 @@ from statuses import status
 from companion.errors import WireError
 from companion.operator.views import status_table
 from companion.wire.operator import Status, as_json, decode
-from sim.launch.launch import Progress
 from sim.launch.view import FlightView, show_summary
+from sim.launch.watch import Progress
 
 LONG = "its clock is 0.341 s behind that of vehicle 3, " * 12
 REMARKS = st.text(max_size=300) | st.sampled_from([LONG, "[red]bold[/red]", "\x1b[2J\n\n\r\t", "飛行" * 60, ""])

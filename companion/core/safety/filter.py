@@ -202,7 +202,7 @@ def out_of_reach(ego: VehicleState, shared_acceleration: Ned, neighbour: Neighbo
 
 def resting_push_m_s2(distance_m: float, radius_m: float) -> float:
     """`push_m_s2` of a pair that rests at a level distance and shares the avoidance, with its safety radius (m/s^2)."""
-    return push_m_s2(HalfPlane(*barrier(distance_m, 0.0, 0.0, 0.0, 0.0, 0.0, radius_m, True, 0.0, 0.0), 0))
+    return push_m_s2(HalfPlane(*barrier(distance_m, 0.0, 0.0, 0.0, 0.0, 0.0, radius_m, True, 0.0, 0.0)))
 
 
 def push_m_s2(plane: HalfPlane) -> float:

@@ -1,0 +1,63 @@
+"""One companion as a process: signals, the garbage collector, the interpreter's switching, around the loop."""
+
+import gc
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+
+from companion.config import FleetConfig
+from companion.io.loop import Companion, RunSettings
+
+SWITCH_INTERVAL_S = 0.0005
+"""how long the recorder or a network callback may keep the interpreter from the loop"""
+
+
+def fly_vehicle(
+    config: FleetConfig, vehicle_id: int, file: Path, text: str, *, record: Path | None, stop_fd: int | None
+) -> int:
+    """Fly until SIGTERM, SIGINT or the end of `stop_fd`; returns the exit status. Main thread only.
+
+    `text` is what the file of the configuration held when it was read.
+    """
+
+    def log(line: str) -> None:
+        # Not through a buffer, which on a full disk would fail again at the end and change the exit status.
+        os.write(1, f"vehicle {vehicle_id}: {line}\n".encode())
+
+    settings = RunSettings(vehicle_id, record, stop_fd, log, file)
+    companion = Companion(config, settings, {"config": text, "version": product_version()})
+    try:
+        return run_in_process(companion)
+    finally:
+        companion.close()
+
+
+@cache
+def product_version() -> str:
+    """Of this package, as installed."""
+    return version("starling-fleet")
+
+
+def run_in_process(companion: Companion) -> int:
+    """The loop with this process at its service."""
+    # What is there by now stays: the collector need not look through it in flight.
+    gc.collect()
+    gc.freeze()
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
+    with _signals(companion.ask_to_stop):
+        return companion.run()
+
+
+@contextmanager
+def _signals(stop: Callable[[], None]) -> Iterator[None]:
+    previous = {s: signal.signal(s, lambda *_: stop()) for s in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        yield
+    finally:
+        for s, handler in previous.items():
+            signal.signal(s, handler)

@@ -1,0 +1,54 @@
+"""What the loop itself records beside the agent's inputs and outputs: each tick's figures, and the traffic."""
+
+import struct
+from typing import NamedTuple, Self
+
+TICK = struct.Struct("<qqqff?6f")
+TRAFFIC = struct.Struct("<q")
+
+
+class TickRecord(NamedTuple):
+    """Body of the "tick" channel. Positions and velocities are the vehicle's own belief, fleet frame (NED)."""
+
+    lateness_ns: int
+    """how long after its deadline, or after the position that it follows from, the setpoint was sent"""
+    latency_ns: int
+    """sensor to setpoint; -1 for a timer's tick"""
+    cpu_ns: int
+    """of the loop's thread so far"""
+    position_error_m: float
+    nearest_m: float
+    """to the nearest neighbour"""
+    steered: bool
+    """whether a setpoint was sent"""
+    north_m: float
+    east_m: float
+    down_m: float
+    north_m_s: float
+    east_m_s: float
+    down_m_s: float
+
+    def pack(self) -> bytes:
+        """As recorded."""
+        return TICK.pack(*self)
+
+    @classmethod
+    def unpack(cls, body: bytes) -> Self:
+        """From a recording; struct.error if it is none."""
+        return cls(*TICK.unpack(body))
+
+
+class TrafficRecord(NamedTuple):
+    """Body of the "traffic" channel, each second."""
+
+    bytes_sent: int
+    """by this companion's network connections so far"""
+
+    def pack(self) -> bytes:
+        """As recorded."""
+        return TRAFFIC.pack(*self)
+
+    @classmethod
+    def unpack(cls, body: bytes) -> Self:
+        """From a recording; struct.error if it is none."""
+        return cls(*TRAFFIC.unpack(body))

@@ -1,0 +1,50 @@
+"""The same figures as the companions' own estimates have them: what is judged where nobody knows the truth."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from companion.core.trajectory.history import TrajectoryHistory
+from sim.launch.summary.flight import POSITION, TICK_ROWS, VELOCITY, Array, Flight
+from sim.launch.summary.numbers import rounded
+from sim.launch.summary.steady import errors_from_slots, steady_at
+
+STEP_NS = 100_000_000
+
+
+def times_of(flight: Flight, ids: Sequence[int]) -> Array:
+    """Ten times a second while every companion has ticked since the take-off."""
+    rows = [flight.ticks.get(i, np.zeros(0, TICK_ROWS)) for i in ids]
+    if not rows or not all(len(r) for r in rows):
+        return np.zeros(0, np.int64)
+    begin = max(flight.takeoff_ns, *(int(r["fleet_ns"][0]) for r in rows))
+    return np.arange(begin, min(int(r["fleet_ns"][-1]) for r in rows), STEP_NS, dtype=np.int64)
+
+
+def _motion(flight: Flight, ids: Sequence[int], times: Array, axes: Sequence[str]) -> Array:
+    """Positions or velocities as the companions have them, over (time, vehicle, axis)."""
+    if not len(times):
+        return np.zeros((0, len(ids), 3))
+    rows = [flight.ticks[i] for i in ids]
+    return np.stack(
+        [np.stack([np.interp(times, r["fleet_ns"], r[axis]) for axis in axes], axis=1) for r in rows], axis=1
+    )
+
+
+def believed_errors(
+    flight: Flight, history: TrajectoryHistory, ids: Sequence[int], formed: int | None, window: tuple[int, int]
+) -> dict[str, Any]:
+    """The same errors as the companions' own estimates have them."""
+    times = times_of(flight, ids)
+    times = times[steady_at(flight, history, times, formed) & (times >= window[0]) & (times <= window[1])]
+    motion = (_motion(flight, ids, times, axes) for axes in (POSITION, VELOCITY))
+    return errors_from_slots(history, ids, times, *motion)
+
+
+def minimum_distance_m(flight: Flight, ids: Sequence[int]) -> float | None:
+    """Smallest distance of any pair from the take-off on, by their own estimates."""
+    p = _motion(flight, ids, times_of(flight, ids), POSITION)
+    i, j = np.triu_indices(len(ids), 1)
+    distance = np.linalg.norm(p[:, i] - p[:, j], axis=2)
+    return rounded(float(distance.min())) if distance.size else None

@@ -1,0 +1,90 @@
+"""The part of a flight that its errors are taken over, and the errors: from the slots that the plan gives."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from companion.core.events import PhaseChanged
+from companion.core.trajectory.history import TrajectoryHistory
+from companion.core.values import Phase
+from sim.launch.summary.flight import Array, Flight
+from sim.launch.summary.numbers import rounded
+from sim.measures import algebraic_connectivity, centroid_error_m, formation_error_m, velocity_error_m_s
+
+SETTLING_S = 3.0
+"""left out of the steady part after forming and after a change of formation"""
+WINDOW_S = 10.0
+LEFT_FORMATION = frozenset({Phase.IDLE, Phase.RETURNING, Phase.LANDING, Phase.LANDED, Phase.RELEASED})
+"""phases with which the steady part ends"""
+CONNECTED_WITHIN_M = 100.0
+
+
+def formed_ns(flight: Flight, staying: Sequence[int]) -> int | None:
+    """When the last vehicle first reported that it had formed."""
+    first: dict[int, int] = {}
+    for time_ns, i, event in flight.events:
+        if isinstance(event, PhaseChanged) and event.after is Phase.FORMED:
+            first[i] = min(time_ns, first.get(i, time_ns))
+    return max(first[i] for i in staying) if staying and all(i in first for i in staying) else None
+
+
+def steady_at(flight: Flight, history: TrajectoryHistory, times: Array, formed: int | None) -> npt.NDArray[np.bool_]:
+    """Where all that stayed are formed and not changing their formation."""
+    if formed is None or not len(times):
+        return np.zeros(len(times), bool)
+    steady = times >= formed + round(SETTLING_S * 1e9)
+    left = [
+        t
+        for t, i, event in flight.events
+        if isinstance(event, PhaseChanged) and event.after in LEFT_FORMATION and t > formed and i not in flight.lost
+    ]
+    if left:
+        steady &= times < min(left)
+    for motion in history.motions[1:]:
+        if motion.blend_start_ns == motion.start_ns:
+            steady &= (times < motion.start_ns) | (times > motion.blend_end_ns + round(SETTLING_S * 1e9))
+    return np.asarray(steady, bool)
+
+
+def errors_from_slots(
+    history: TrajectoryHistory, ids: Sequence[int], times: Array, position: Array, velocity: Array
+) -> dict[str, Any]:
+    """Errors of formation, velocity, centroid and altitude; positions and velocities over (time, vehicle, axis)."""
+    names = ("formation_error_rms_m", "velocity_error_rms_m_s", "centroid_error_rms_m")
+    if not len(times):
+        return {**dict.fromkeys(names), "altitude_error_max_m": None, "lambda2_min": None, "windows": []}
+    formation, consensus, centroid, altitude = [], [], [], []
+    for t, p, v in zip(times, position, velocity, strict=True):
+        motion = history.at(int(t))
+        state = motion.state_at(int(t))
+        slots = [state.slot(motion.slots[i]) for i in ids]
+        p_ref = np.array([s.position_ned_m for s in slots])
+        v_ref = np.array([s.velocity_ned_m_s for s in slots])
+        formation.append(np.square(formation_error_m(p, p_ref)).mean())
+        consensus.append(np.square(velocity_error_m_s(v, v_ref)).mean())
+        centroid.append(centroid_error_m(p, p_ref) ** 2)
+        altitude.append(np.abs(p[:, 2] - p_ref[:, 2]).max())
+    windows = []
+    start = int(times[0])
+    for k in range(int((times[-1] - start) * 1e-9 / WINDOW_S) + 1):
+        inside = (times >= start + k * WINDOW_S * 1e9) & (times < start + (k + 1) * WINDOW_S * 1e9)
+        if inside.sum() > 1:
+            windows.append(
+                {
+                    "from_s": k * WINDOW_S,
+                    "formation_error_rms_m": rounded(float(np.sqrt(np.array(formation)[inside].mean()))),
+                    "velocity_error_rms_m_s": rounded(float(np.sqrt(np.array(consensus)[inside].mean()))),
+                }
+            )
+    return {
+        **{
+            n: rounded(float(np.sqrt(np.mean(x)))) for n, x in zip(names, (formation, consensus, centroid), strict=True)
+        },
+        "altitude_error_max_m": rounded(float(np.max(altitude))),
+        "lambda2_min": rounded(
+            min(algebraic_connectivity(p, CONNECTED_WITHIN_M) for p in position[:: max(len(position) // 20, 1)])
+        ),
+        "windows": windows,
+    }
