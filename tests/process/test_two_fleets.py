@@ -7,7 +7,11 @@ from pathlib import Path
 import pytest
 from fleet_process import Fleet, make_fleet, operator_of, run, started, wait_status
 
+from companion.io.network import operator_link
+
 pytestmark = [pytest.mark.process, pytest.mark.timeout(400)]
+SESSIONS = 40
+"""of sessions that ask as soon as somebody answers, one in nine has not found the second companion"""
 
 
 def elsewhere(fleet: Fleet, folder: Path) -> Path:
@@ -66,3 +70,23 @@ def test_a_launcher_refuses_a_name_that_another_launcher_flies(tmp_path: Path) -
         assert "is flown on this machine already" in refused.stderr
         assert up.popen.poll() is None
         assert len(list((tmp_path / "flights").iterdir())) == 1
+
+
+def test_every_new_session_of_an_operator_finds_both_companions_of_an_id_at_its_first_question(tmp_path: Path) -> None:
+    one, two = tmp_path / "one", tmp_path / "two"
+    one.mkdir()
+    two.mkdir()
+    fleet = make_fleet(one, 1)
+    other = elsewhere(fleet, two)
+    with ExitStack() as stack:
+        for file, name in ((fleet.file, "a"), (other, "b")):
+            run_it = ("companion", "run", "--vehicle", "1", "--fleet", str(file))
+            stack.enter_context(started(*run_it, folder=tmp_path, name=f"companion-{name}"))
+        operator = stack.enter_context(operator_of(fleet))
+        wait_status(operator, lambda _: 1 in operator.roster.doubled)
+        answered = []
+        for _ in range(SESSIONS):
+            with operator_link(fleet.config) as link:
+                link.wait_alive([1], 5.0)
+                answered.append(len(link.ask([1], "status", b"", 1.0, 0.5)[1]))
+    assert answered == [2] * SESSIONS

@@ -21,6 +21,9 @@ ANSWERS_MAX: Final = 8
 """answers to one question: more than one is a fault already"""
 _LIVELINESS_TIMEOUT_S: Final = 1.0
 _ALIVE_POLL_S: Final = 0.02
+SETTLED_S: Final = 0.2
+"""a session is settled once it has found nobody new for so long. Just after it opens, vehicles of one machine are found
+within 30 ms of each other: who asks before that hears one of two companions and takes it for the only one"""
 
 
 class ZenohOperatorLink:
@@ -61,12 +64,25 @@ class ZenohOperatorLink:
         return frozenset(found)
 
     def wait_alive(self, vehicle_ids: Iterable[int], timeout_s: float) -> frozenset[int]:
-        """Wait until all of these are alive, at most `timeout_s`; returns who is alive then."""
+        """Wait until all of these are alive and the session is settled, at most `timeout_s` for the first; returns who
+        is alive then."""
         expected = frozenset(vehicle_ids)
         deadline_s = time.monotonic() + timeout_s
-        while not expected <= (alive := self.alive()) and time.monotonic() < deadline_s:
+        while not expected <= self.alive() and time.monotonic() < deadline_s:
             time.sleep(_ALIVE_POLL_S)
-        return alive
+        self._settle()
+        return self.alive()
+
+    def _settle(self) -> None:
+        """Wait until nobody new has been found for SETTLED_S, at most for ten times that."""
+        info = self._opened().info
+        known, since_s = frozenset(map(str, info.peers_zid())), time.monotonic()
+        deadline_s = since_s + 10.0 * SETTLED_S
+        while (now_s := time.monotonic()) < min(since_s + SETTLED_S, deadline_s):
+            time.sleep(_ALIVE_POLL_S)
+            found = frozenset(map(str, info.peers_zid()))
+            if not found <= known:
+                known, since_s = known | found, now_s
 
     def ask(
         self, vehicle_ids: Iterable[int], kind: str, payload: bytes, timeout_s: float, retry_s: float
