@@ -19,8 +19,12 @@ MODULES = (
         "commander", "estimator", "events", "link", "navigator", "offboard", "parameters", "services", "telemetry",
     )),
     *(f"companion/core/{name}.py" for name in (
-        "estimate", "frames", "law/base", "law/starling", "neighbours", "prediction", "safety/filter", "trajectory",
+        "estimate", "frames", "law/base", "law/starling", "prediction", "safety/filter", "safety/program",
         "trigger/base", "trigger/error", "trigger/periodic", "trigger/switching", "values", "vectors",
+        *(f"neighbours/{name}" for name in ("examination", "gates", "lost", "sample", "silence", "table", "track")),
+        *(f"trajectory/{name}" for name in (
+            "fleet", "goto", "history", "legs", "polynomials", "slots", "successors",
+        )),
     )),
 )  # fmt: skip
 """what costs most of a flight, and what those build on; the rest is interpreted as ever"""
@@ -32,7 +36,8 @@ def build(folder: Path) -> None:
         raise CompanionError(f"{folder}: exists already; name a new folder")
     for package in PACKAGES:
         shutil.copytree(ROOT / package, folder / package, ignore=shutil.ignore_patterns("__pycache__"))
-    shutil.copy(ROOT / "pyproject.toml", folder)
+    for file in ("pyproject.toml", "fleet.toml"):
+        shutil.copy(ROOT / file, folder)
     quick = {"MYPYC_OPT_LEVEL": "1", "MYPYC_DEBUG_LEVEL": "0"}
     made = subprocess.run(
         [sys.executable, "-c", "from mypyc.__main__ import main; main()", "--strict", *MODULES],

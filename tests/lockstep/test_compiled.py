@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from companion.errors import CompanionError
-from sim.lockstep.compiled import ROOT, build
+from sim.lockstep.compiled import MODULES, ROOT, build
 
 SEEDS = ("0", "1", "1001")
 
@@ -31,3 +31,8 @@ def test_a_compiled_flight_is_the_same_to_the_last_digit_and_note(tmp_path: Path
 def test_a_compiled_copy_is_made_in_a_new_folder_alone(tmp_path: Path) -> None:
     with pytest.raises(CompanionError, match="exists already; name a new folder"):
         build(tmp_path)
+
+
+def test_what_is_compiled_is_there() -> None:
+    assert [module for module in MODULES if not (ROOT / module).is_file()] == []
+    assert len(set(MODULES)) == len(MODULES)
