@@ -35,8 +35,8 @@ PRESENCE_DELAY_NS = 100_000_000
 TRUTH_INTERVAL_NS = 20_000_000
 FOR_EVER_S = 1e9
 READY_S, CLIMB_S = 200.0, 30.0
-"""how long a take-off waits for all to be ready, and for all to be in the air; on the ground they speak every 8 to 10
-s: at 50 % loss it takes a while until all have heard each other"""
+"""how long a take-off waits for all to be ready, and then for all to be in the air; on the ground they speak every 8 to
+10 seconds, so that at 50 % loss it takes a while until all have heard each other"""
 NEVER_NS = 1 << 62
 
 
