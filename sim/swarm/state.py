@@ -170,10 +170,9 @@ class State(NamedTuple):
     events: Ints
     """(most, 2): step, agent"""
     counts: Ints
-    """[number of events, bytes' samples sent, mode steps dynamic, mode steps fixed, filter active]"""
+    """[number of events, bytes' samples sent, mode steps dynamic, mode steps fixed]"""
     record: Floats
     """(steps kept, N, 6)"""
-    record_u: Floats
 
 
 MEASURES = (

@@ -44,8 +44,6 @@ class Run:
     """(T, N, 3)"""
     velocity_m_s: Floats
     """(T, N, 3)"""
-    command_m_s2: Floats
-    """(T, N, 3)"""
     reference: Floats
     """(T, N, 6): p_ref,i of each slot and its velocity"""
     events: Ints
@@ -56,8 +54,6 @@ class Run:
     steps_dynamic: int
     steps_fixed: int
     """agent-steps in each mode of Eq. (5)"""
-    filter_active: int
-    """agent-steps in which the barrier changed a command"""
     measures: dict[str, float] = field(default_factory=dict)
 
     def healthy(self) -> npt.NDArray[np.bool_]:
@@ -80,11 +76,6 @@ class Run:
         """Velocity against the agents' mean, shape (T, healthy)."""
         v = self.velocity_m_s[:, self.healthy()]
         return np.asarray(np.linalg.norm(v - v.mean(axis=1, keepdims=True), axis=2))
-
-    def rms_formation_m(self, after_s: float = 8.0) -> float:
-        """F: RMS over agents and time of the formation error."""
-        kept = self.formation_error_m()[self.time_s > after_s]
-        return float(np.sqrt((kept**2).mean()))
 
     def intervals_s(self) -> Floats:
         """Times between two messages of one agent."""
@@ -198,7 +189,7 @@ def state_of(
         **_room(int(np.diff(start).max()) + 1),
         measures=np.array([1e9, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]),
         events=np.zeros((n * (steps // setup.control_every + 1), 2), dtype=np.int64),
-        counts=np.zeros(5, dtype=np.int64), record=np.zeros((kept, n, 6)), record_u=np.zeros((kept, n, 3)),
+        counts=np.zeros(4, dtype=np.int64), record=np.zeros((kept, n, 6)),
     )  # fmt: skip
     _start_estimates(s, setup, table, o)
     return s
@@ -238,14 +229,12 @@ def run(setup: Setup, seed: int, *, reference: Floats | None = None, start: tupl
         time_s=np.asarray(kept_steps * setup.dt_s, dtype=np.float64),
         position_m=s.record[:, :, :3],
         velocity_m_s=s.record[:, :, 3:],
-        command_m_s2=s.record_u,
         reference=place,
         events=s.events[: s.counts[0]].copy(),
         messages=int(s.counts[0]),
         samples_sent=int(s.counts[1]),
         steps_dynamic=int(s.counts[2]),
         steps_fixed=int(s.counts[3]),
-        filter_active=int(s.counts[4]),
         measures=dict(zip(MEASURES, map(float, s.measures), strict=True)),
     )
 
