@@ -9,6 +9,7 @@ from companion.config.schema import FenceTable, GotoLegTable, TurnLegTable, Velo
 from companion.core.formation import minimum_distance
 from companion.core.law.base import FIELDS_MAX
 from companion.core.safety.fence import Fence
+from companion.core.trajectory.fleet import FleetTrajectory
 from companion.core.trajectory.successors import with_legs
 from companion.core.trajectory_check import PLAN_SPEED_SHARE, TURN_RATE_MIN_DEG_S, Fault, examine
 from companion.errors import ConfigError
@@ -20,10 +21,10 @@ def faults(config: FleetConfig) -> list[str]:
     if found:
         return found
     try:
-        config.slots(config.formation.shape)
+        formed = config.first_formation
     except ConfigError as error:
         return [str(error)]
-    return list(_motion_faults(config))
+    return list(_motion_faults(config, formed))
 
 
 def _rule_faults(config: FleetConfig) -> Iterator[str]:
@@ -161,9 +162,9 @@ def _fence_faults(fence: FenceTable) -> Iterator[str]:
         yield f"$.fence.polygon_m must be wider than twice $.fence.margin_m = {fence.margin_m:g} m, got nothing inside"
 
 
-def _motion_faults(config: FleetConfig) -> Iterator[str]:
+def _motion_faults(config: FleetConfig, formed: FleetTrajectory) -> Iterator[str]:
     """Pads that are not inside the fence, and motions that the vehicles would refuse of each other: the way into the
-    formation, the plan, the way back."""
+    formation (`formed`), the plan, the way back."""
     fence = config.geofence
     if fence is not None:
         yield from _pad_faults(config, fence)
@@ -174,9 +175,8 @@ def _motion_faults(config: FleetConfig) -> Iterator[str]:
             f"got {config.formation.altitude_m:g}"
         )
         return
-    limits, first = config.motion_limits, config.first_motion
-    formed = config.motion_into(config.formation.shape, first, 0, 0)
-    fault = examine(formed, limits, first).fault
+    limits = config.motion_limits
+    fault = examine(formed, limits, config.first_motion).fault
     if fault is not None:
         yield _formation_sentence(fault)
         return

@@ -26,7 +26,7 @@ from companion.core.trajectory.legs import Leg, TurnLeg, VelocityLeg, leg_end
 from companion.core.trajectory.slots import SlotChange
 from companion.core.trajectory.successors import with_formation, with_return
 from companion.core.trajectory_check import ALTITUDE_MIN_M, PLAN_SPEED_SHARE, MotionLimits
-from companion.core.trigger.base import Spacing, Trigger
+from companion.core.trigger.base import Trigger
 from companion.core.trigger.periodic import PeriodicTrigger
 from companion.core.values import ZERO
 from companion.errors import ConfigError
@@ -122,10 +122,6 @@ class FleetConfig(FleetTables):
     def near_rate(self) -> PeriodicTrigger:
         """When vehicles speak that are near each other."""
         return PeriodicTrigger(self.trigger.near_period_s)
-
-    @property
-    def message_spacing(self) -> Spacing:
-        return Spacing(self.trigger.t_min_s, self.trigger.t_max_s)
 
     @cached_property
     def prediction_error_m(self) -> float:

@@ -97,8 +97,8 @@ class Registry(Generic[T]):
         table = self._chosen(value)
         if table is None:
             raise PydanticCustomError("kind", "unknown", {"known": ", ".join(self.known()), "came": value["kind"]})
-        own = table.model_fields.keys()
-        beside = {k: v for k, v in value.items() if k in self.fields(value) and k not in own}
+        others = self.fields(value).keys() - table.model_fields.keys()
+        beside = {k: v for k, v in value.items() if k in others}
         made = table.model_validate_json(json.dumps({k: v for k, v in value.items() if k not in beside}))
         for other in self._ours.values():
             other.model_validate_json(json.dumps({k: v for k, v in beside.items() if k in other.model_fields}))

@@ -27,8 +27,8 @@ from companion.core.trajectory.legs import (
     velocity_ramp_s,
 )
 from companion.core.trajectory.polynomials import MINIMUM_JERK_BEND
-from companion.core.trajectory.slots import SlotChange
 from companion.core.values import ZERO
+from companion.core.vectors import lerp
 
 RESOLUTION_M = 0.01
 """a breach between two looks that is no deeper than this may be missed"""
@@ -276,17 +276,13 @@ class _March:
         return worst
 
 
-def first_breach(motion: FleetTrajectory, fence: Fence | None) -> Breach | None:
-    """The first leg that leads a slot beyond the fence's margin, with the worst of that leg; None if all stay inside.
+def examined(motion: FleetTrajectory, fence: Fence) -> tuple[Breach | None, float]:
+    """The first leg that leads a slot beyond the fence's margin, with the worst of that leg (None if all stay inside);
+    and the looks that it took.
 
     A motion that starts beyond the margin is a way back if it ends no further out, whatever it passes: the safety
     filter holds the vehicles meanwhile.
     """
-    return None if fence is None or not motion.slots else examined(motion, fence)[0]
-
-
-def examined(motion: FleetTrajectory, fence: Fence) -> tuple[Breach | None, float]:
-    """`first_breach` of a motion with slots, and the looks that it took."""
     march = _March(motion, fence)
     room, _ = march.least_room(motion.start_ns)
     march.allowed_m = min(room, 0.0) - TOLERANCE_M
@@ -321,7 +317,7 @@ def slots_apart_m(motion: FleetTrajectory) -> float:
     All pass from before to after by the same share at a time, so that two slots' offset moves on a straight line.
     """
     gone = motion.state_at(motion.start_ns).blend[0]
-    now = [(_between(change, gone), change.after) for change in motion.slots.values()]
+    now = [(lerp(*change, gone), change.after) for change in motion.slots.values()]
     least2 = inf
     for k, (a, a_after) in enumerate(now):
         for b, b_after in now[:k]:
@@ -340,10 +336,5 @@ def slots_continue(motion: FleetTrajectory, before: FleetTrajectory, tolerance_m
     """Whether a motion's slots begin where those of the one before are then."""
     gone, there = (m.state_at(motion.start_ns).blend[0] for m in (motion, before))
     return all(
-        dist(_between(change, gone), _between(before.slots[i], there)) <= tolerance_m
-        for i, change in motion.slots.items()
+        dist(lerp(*change, gone), lerp(*before.slots[i], there)) <= tolerance_m for i, change in motion.slots.items()
     )
-
-
-def _between(change: SlotChange, share: float) -> Ned:
-    return Ned(*(a + share * (b - a) for a, b in zip(*change, strict=True)))

@@ -1,4 +1,4 @@
-"""Vector helpers that the peer table and the safety filter share."""
+"""Vector helpers that the peer table, the trajectories and the safety filter share."""
 
 from collections.abc import Sequence
 from math import dist, inf

@@ -91,7 +91,7 @@ class Publisher:
         self._history = history
         self._peers = peers
         self._random = random
-        self._spacing = config.message_spacing
+        self._t_min_s, self._t_max_s = config.trigger.t_min_s, config.trigger.t_max_s
         self._slots_m = (config.spacing_min_m, config.safety_radius_m)
         """the least distance of two slots, and the safety radius"""
         self._spread_ns = spread_ns(len(config.vehicles))
@@ -192,9 +192,7 @@ class Publisher:
         )
         self._sent = (sample, self._reference_then(sample))
         self._sent_ns, self._told = now.monotonic_ns, own.told
-        self._silence_limit_s = self._spacing.t_max_s * (
-            1.0 - HEARTBEAT_JITTER + HEARTBEAT_JITTER * self._random.random()
-        )
+        self._silence_limit_s = self._t_max_s * (1.0 - HEARTBEAT_JITTER + HEARTBEAT_JITTER * self._random.random())
         self._sequence = (self._sequence + 1) % (1 << 32)
         self.near.promised = near
         self.messages_sent += 1
@@ -222,7 +220,7 @@ class Publisher:
         if since_s >= self._silence_limit_s:
             return "heartbeat"
         situation = self._situation(self._sent, own, now)
-        if (since_s >= self._spacing.t_min_s or not self.trigger.waits) and self.trigger.fires(situation):
+        if (since_s >= self._t_min_s or not self.trigger.waits) and self.trigger.fires(situation):
             return "triggered"
         return "near" if self.near.fires(situation, near) else None
 

@@ -19,13 +19,14 @@ MODULES = (
         "commander", "estimator", "events", "link", "navigator", "offboard", "parameters", "services", "telemetry",
     )),
     *(f"companion/core/{name}.py" for name in (
-        "estimate", "frames", "law/base", "law/starling", "prediction", "safety/filter", "safety/program",
-        "trigger/base", "trigger/error", "trigger/periodic", "trigger/switching", "values", "vectors",
-        *(f"neighbours/{name}" for name in ("examination", "gates", "lost", "sample", "silence", "table", "track")),
-        *(f"trajectory/{name}" for name in (
-            "fleet", "goto", "history", "legs", "polynomials", "slots", "successors",
-        )),
+        "estimate", "frames", "law/base", "law/starling", "prediction", "safety/filter", "trigger/base",
+        "trigger/error", "trigger/periodic", "trigger/switching", "values", "vectors",
     )),
+    *(
+        path.relative_to(ROOT).as_posix()
+        for package in ("neighbours", "trajectory")
+        for path in sorted((ROOT / "companion" / "core" / package).glob("*.py"))
+    ),
 )  # fmt: skip
 """what costs most of a flight, and what those build on; the rest is interpreted as ever"""
 

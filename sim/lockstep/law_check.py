@@ -1,8 +1,8 @@
 """What a law, ours or another package's, must show before it is flown: `fleet law check NAME`.
 
 Random states, the same ones twice, the time of a call, and two real agents in lockstep that the law itself sends
-head-on at each other, since each is told the other's slot. All of it is with what flies; a compiled form, where a law
-offers one (`compiled`, a method that returns it), must give the same commands.
+head-on at each other, since each is told the other's slot. All of it is with what flies; the form of our own that the
+swarm compiles must give the same commands.
 """
 
 import struct
@@ -20,11 +20,11 @@ from companion.core.law.base import Law, Wanted
 from companion.core.law.starling import StarlingLaw
 from companion.core.safety.filter import COLLISION_DISTANCE_M
 from companion.core.trajectory.fleet import Reference
-from companion.core.values import Neighbour, Phase, VehicleState
-from companion.errors import CompanionError
+from companion.core.values import Neighbour, VehicleState
 from companion.vehicle.guest import LAW_RAISED
 from sim.lockstep.lockstep import Lockstep
 from sim.lockstep.network import NetworkParameters
+from sim.lockstep.wrapped_law import WrappedLaw
 
 STATES = 3000
 SEEDS = (1, 2, 3)
@@ -32,7 +32,7 @@ CALL_MAX_US = 1000.0
 """of one call with fifteen neighbours: a twentieth of the control period at 50 Hz"""
 SAME = 1e-9
 """compiled commands differ by no more than this part of what is summed"""
-APART_M, ALTITUDE_M, READY_S, CLIMB_S, MEETING_S = 12.0, 6.0, 200.0, 30.0, 15.0
+APART_M, ALTITUDE_M, MEETING_S = 12.0, 6.0, 15.0
 LAG_S, DELAY_S = 0.3, 0.1
 
 
@@ -169,11 +169,9 @@ def _compiled(config: FleetConfig, scenes: Sequence[Scene]) -> Row:
 
 
 def compiled_form(law: Law) -> Law | None:
-    """A law as it is compiled, if it offers that and what compiles it is installed."""
+    """A law as the swarm compiles it: ours, where what compiles them is installed."""
     if not isinstance(law, StarlingLaw):
-        offered = getattr(law, "compiled", None)
-        made: Law | None = offered() if callable(offered) else None
-        return made
+        return None
     try:
         from sim.swarm.rows import CompiledLaw
     except ModuleNotFoundError:
@@ -182,10 +180,9 @@ def compiled_form(law: Law) -> Law | None:
 
 
 @dataclass(slots=True)
-class OthersSlot:
+class OthersSlot(WrappedLaw):
     """A law that is told another's slot for its own, once `begun`: it flies head-on by itself."""
 
-    law: Law
     begun: bool = False
 
     def command(
@@ -199,19 +196,6 @@ class OthersSlot:
         around = [n._replace(offset_ned_m=Ned(*(-x for x in n.offset_ned_m))) for n in neighbours]
         return self.law.command(ego, there, around, alone=alone)
 
-    def reset(self) -> None:
-        """See `Law`."""
-        self.law.reset()
-
-    @property
-    def fields(self) -> tuple[str, ...]:
-        """See `Law`."""
-        return self.law.fields
-
-    def tell(self) -> tuple[float, ...]:
-        """See `Law`."""
-        return self.law.tell()
-
 
 def head_on(config: FleetConfig, seed: int) -> tuple[float, int]:
     """Two vehicles that wait, each told the other's slot: their least distance (m), and how often a law raised.
@@ -223,11 +207,7 @@ def head_on(config: FleetConfig, seed: int) -> tuple[float, int]:
     for v in fleet.vehicles.values():
         v.agent.law = OthersSlot(v.agent.law)
         laws.append(v.agent.law)
-    fleet.run_until(READY_S, lambda: not any(v.agent.operator.unready(fleet.now) for v in fleet.vehicles.values()))
-    fleet.command(b'{"verb":"takeoff"}')
-    fleet.run_until(fleet.now_ns * 1e-9 + CLIMB_S, lambda: fleet.all_in(Phase.WAITING))
-    if not fleet.all_in(Phase.WAITING):
-        raise CompanionError(f"law check: the two are not in the air {CLIMB_S:g} s after the command: {fleet.notes}")
+    fleet.take_off()
     begin_ns = fleet.now.fleet_ns
     for law in laws:
         law.begun = True

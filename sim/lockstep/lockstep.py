@@ -19,6 +19,7 @@ from companion.core.events import Event
 from companion.core.failsafe import Failsafe
 from companion.core.frames import Ned
 from companion.core.values import Instant, Phase
+from companion.errors import CompanionError
 from companion.vehicle.agent import Agent
 from companion.vehicle.outputs import Outputs
 from companion.wire.events import encode_event
@@ -33,6 +34,9 @@ LINK_DELAY_NS = 300_000
 PRESENCE_DELAY_NS = 100_000_000
 TRUTH_INTERVAL_NS = 20_000_000
 FOR_EVER_S = 1e9
+READY_S, CLIMB_S = 200.0, 30.0
+"""how long a take-off waits for all to be ready, and then for all to be in the air; on the ground they speak every 8 to
+10 seconds, so that at 50 % loss it takes a while until all have heard each other"""
 NEVER_NS = 1 << 62
 
 
@@ -44,7 +48,6 @@ class Vehicle:
     autopilot: Autopilot
     alive: bool = True
     """whether the companion runs"""
-    truth_gap_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -304,6 +307,19 @@ class Lockstep:
                 answers[i] = v.agent.receive_command(payload, self.now)
                 self._log(i, "output/answer", answers[i])
         return answers
+
+    def run_until_ready(self, time_s: float) -> None:
+        """Let time pass until no companion knows a reason against its take-off, or until `time_s` from the start."""
+        self.run_until(time_s, lambda: not any(v.agent.operator.unready(self.now) for v in self.vehicles.values()))
+
+    def take_off(self) -> None:
+        """Take off by command once all are ready, and let all come to wait in the air for the operator's next command;
+        CompanionError if some do not."""
+        self.run_until_ready(READY_S)
+        self.command(b'{"verb":"takeoff"}')
+        self.run_until(self.now_ns * 1e-9 + CLIMB_S, lambda: self.all_in(Phase.WAITING))
+        if not self.all_in(Phase.WAITING):
+            raise CompanionError(f"lockstep: not all are in the air {CLIMB_S:g} s after the command: {self.notes}")
 
     def _in_order(self, payload: bytes) -> bytes:
         try:

@@ -279,7 +279,7 @@ def fly(flight: Flight, seed: int, tell: Callable[[str], None] = lambda _: None)
         config, seed=seed, network=NetworkParameters(delay_s=flight.delay_s, loss=flight.loss),
         record=ear.listen if lies else None,
     )  # fmt: skip
-    ls.run_until(READY_S, lambda: not any(v.agent.operator.unready(ls.now) for v in ls.vehicles.values()))
+    ls.run_until_ready(READY_S)
     answers = {i: json.loads(a) for i, a in ls.command(b'{"verb":"takeoff"}').items()}
     if len(answers) < flight.vehicles or not all(a["accepted"] for a in answers.values()):
         raise RuntimeError(f"seed {seed}: the take-off is refused before any fault: {answers}")

@@ -21,8 +21,8 @@ import numpy.typing as npt
 from scipy.stats import beta
 
 from companion.errors import ConfigError
-from sim.swarm import swarm
-from sim.swarm.swarm import Run, Setup, setup_from
+from sim.swarm.setup import Setup, connected, setup_from
+from sim.swarm.swarm import Run, kernels
 
 Floats = npt.NDArray[np.float64]
 Record = dict[str, Any]
@@ -148,7 +148,7 @@ def load_config(name: str, path: Path | None = None) -> Config:
         raise ConfigError(f"{path}: is not TOML: {error}") from error
     config = Config(name, text, values)
     for setup in [config.base, *config.cases().values()]:
-        if not swarm.connected(setup.formation.slots(), setup.range_m):
+        if not connected(setup.formation.slots(), setup.range_m):
             raise ConfigError(
                 f"{path.name}: the formation is not connected at range_m = {setup.range_m:g} m: "
                 "raise range_m or bring the slots closer together"
@@ -195,12 +195,12 @@ def fingerprint(config: Config) -> str:
     digest = blake2s(digest_size=8)
     digest.update(config.text.encode())
     if config.name not in FLOWN_STUDIES:
-        swarm.kernels()
+        kernels()
         from sim.swarm.compiled import source_hash
 
         digest.update(source_hash().encode())
     module = study_module(config.name)
-    for path in (module.__file__, swarm.__file__, *getattr(module, "SOURCES", ())):
+    for path in (module.__file__, *getattr(module, "SOURCES", ())):
         digest.update(Path(str(path)).read_bytes())
     return digest.hexdigest()
 

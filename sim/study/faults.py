@@ -6,7 +6,8 @@ import numpy as np
 
 from sim.study.common import Column, Config, Figure, Outcome, Record, Table, measured, over_seeds, proportion_text
 from sim.study.figures import BLUE, GREEN, GREY, RED, panels
-from sim.swarm.swarm import Run, Setup, run, setup_from
+from sim.swarm.setup import Setup, setup_from
+from sim.swarm.swarm import Run, run
 
 TITLE = "Faults and safeguards"
 KEYS = ("fewer_percent", "f_m", "formation_rmse_m", "minimum_distance_m", "peak_command_m_s2", "bound_worst_ratio")

@@ -17,8 +17,6 @@ from companion.config import FleetConfig
 from companion.config.file import parse
 from companion.core.frames import Ned
 from companion.core.safety.filter import COLLISION_DISTANCE_M as COLLISION_M
-from companion.core.values import Phase
-from companion.errors import ConfigError
 from sim.lockstep.lockstep import Lockstep
 from sim.lockstep.network import NetworkParameters
 from sim.study.broken_law import BrokenLaw
@@ -28,9 +26,6 @@ from sim.study.never_near import NeverNear
 
 TITLE = "Head-on by a broken law: lag, delay and loss"
 SOURCES = FLYING_CODE
-READY_S = 200.0
-"""on the ground they speak every 8 to 10 s: at 50 % loss it takes a while until both have heard each other"""
-CLIMB_S = 30.0
 MEETING_S = 16.0
 SCATTER_M = 0.05
 """how far the two pads' lines lie apart at most"""
@@ -93,11 +88,7 @@ def meet(
         if near == "off":
             v.agent.publisher.near = NeverNear(v.agent.publisher.near.rate)
         v.agent.law = laws[i] = BrokenLaw(v.agent.law)
-    fleet.run_until(READY_S, lambda: not any(v.agent.operator.unready(fleet.now) for v in fleet.vehicles.values()))
-    fleet.command(b'{"verb":"takeoff"}')
-    fleet.run_until(fleet.now_ns * 1e-9 + CLIMB_S, lambda: fleet.all_in(Phase.WAITING))
-    if not fleet.all_in(Phase.WAITING):
-        raise ConfigError(f"head-on: the two are not in the air {CLIMB_S:g} s after the command: {fleet.notes}")
+    fleet.take_off()
     start_ns, sent = fleet.now_ns, len(fleet.sent)
     for i, way in ((1, 1.0), (2, -1.0)):
         laws[i].velocity_ned_m_s = Ned(way * meeting.speed_m_s, 0.0, 0.0)

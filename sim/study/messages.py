@@ -75,7 +75,7 @@ def fly(fleet: Fleet, case: Case, seed: int) -> Record:
     if not case.near:
         for v in ls.vehicles.values():
             v.agent.publisher.near = NeverNear(v.agent.publisher.near.rate)
-    ls.run_until(READY_S, lambda: not any(v.agent.operator.unready(ls.now) for v in ls.vehicles.values()))
+    ls.run_until_ready(READY_S)
     before, began_ns = _count(ls), ls.now_ns
     ls.command(b'{"verb":"takeoff"}')
     marks = []

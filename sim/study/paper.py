@@ -8,7 +8,8 @@ import numpy.typing as npt
 
 from sim.study.common import Record, measured
 from sim.study.figures import BLUE, GREEN, GREY, ORANGE, panels
-from sim.swarm.swarm import Run, Setup, run
+from sim.swarm.setup import Setup
+from sim.swarm.swarm import Run, run
 
 Floats = npt.NDArray[np.float64]
 

@@ -7,7 +7,8 @@ import numpy as np
 from sim.study.common import Column, Config, Figure, Outcome, Record, Table, over_seeds, proportion_text
 from sim.study.figures import CYCLE, panels
 from sim.study.paper import at, per_axis_rms_m
-from sim.swarm.swarm import Run, Setup, run
+from sim.swarm.setup import Setup
+from sim.swarm.swarm import Run, run
 
 TITLE = "Readings: what the paper's equations can mean"
 GROUPS = {

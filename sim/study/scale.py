@@ -8,8 +8,9 @@ import numpy as np
 
 from sim.study.common import Column, Config, Figure, Outcome, Record, Table, statistics
 from sim.study.figures import BLUE, GREEN, GREY, RED, panels
-from sim.swarm import swarm
-from sim.swarm.swarm import NeighbourList, Setup, kernels, reference_table, run, starts
+from sim.swarm.neighbour_list import NeighbourList
+from sim.swarm.setup import Setup, rules_of, run_options
+from sim.swarm.swarm import kernels, reference_table, run, starts, state_of, with_list
 
 TITLE = "Scale: what a step costs, how long a swarm takes to form"
 BAR_MS = 20.0
@@ -30,8 +31,8 @@ def step_costs(setup: Setup, seed: int, steps: int, relative_speed_m_s: float) -
     from sim.swarm import exchange
 
     n = setup.formation.count
-    plain, filtered = (swarm.run_options(replace(setup, barrier=b)) for b in (False, True))
-    g, ig, et, st, it = swarm.rules_of(setup)
+    plain, filtered = (run_options(replace(setup, barrier=b)) for b in (False, True))
+    g, ig, et, st, it = rules_of(setup)
     table = reference_table(setup, steps + 6)
     x, v = starts(setup, seed)
     rng = np.random.default_rng([seed, 5])
@@ -41,15 +42,13 @@ def step_costs(setup: Setup, seed: int, steps: int, relative_speed_m_s: float) -
     # sorted by cell, so that neighbours in space are neighbours in memory
     order = near.sorted_order(x)
     way = way[order]
-    s = swarm.state_of(
-        setup, seed, plain, table, x[order].copy(), v[order].copy(), setup.formation.slots()[order], near
-    )
+    s = state_of(setup, seed, plain, table, x[order].copy(), v[order].copy(), setup.formation.slots()[order], near)
     whole, barriers, rebuilt, messages = [], [], 0, 0
     turn = round(2.0 / setup.dt_s)
     for k in range(steps + 5):
         s.v[:] = np.array(setup.velocity_m_s) + (1.0 if (k // turn) % 2 == 0 else -1.0) * way
         begin = time.thread_time_ns()
-        s = swarm.with_list(s, near)
+        s = with_list(s, near)
         loops.place_slots(k, s, table)
         loops.measure(k, s, plain)
         loops.filter_own(k, s, plain)

@@ -10,7 +10,8 @@ import numpy.typing as npt
 from sim.measures import algebraic_connectivity
 from sim.study.common import Column, Config, Figure, Outcome, Record, Table, proportion_interval, statistics
 from sim.study.figures import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, panels
-from sim.swarm.swarm import Run, Setup, run, setup_from
+from sim.swarm.setup import Setup, setup_from
+from sim.swarm.swarm import Run, run
 
 TITLE = "Theory: what the proof says and what happens"
 Floats = npt.NDArray[np.float64]

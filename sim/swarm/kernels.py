@@ -283,7 +283,6 @@ def command(k: int, s: State, ref: Floats, o: Options, g: Gains, ig: IntentGains
                 u0, u1, true, reference.acceleration_ned_m_s2, s.near, count, o.avoidance_max, s.planes, s.spare
             )
             u0, u1 = kept.north, kept.east
-            s.counts[4] += 1 if kept.peer else 0
         s.u[i, 0], s.u[i, 1], s.u[i, 2] = u0, u1, u2
 
 
@@ -378,7 +377,6 @@ def advance(
                 for c in range(3):
                     s.record[k // keep_every, i, c] = s.x[i, c]
                     s.record[k // keep_every, i, 3 + c] = s.v[i, c]
-                    s.record_u[k // keep_every, i, c] = s.u[i, c]
         if k % o.every == 0:
             tick = k // o.every
             place_slots(k, s, ref)

@@ -13,7 +13,7 @@ HOLD_ZERO, HOLD_FIRST, HOLD_DAMPED, HOLD_OBSERVER = 0, 1, 2, 3
 ERROR, SWITCHING, PERIODIC, FLOAT_CLOCK, CLASSIC, ELASTIC, INTENT = 0, 1, 2, 3, 4, 5, 6
 SAMPLE = 15
 """floats of a sample: flown law p, v, nu; published intent c, g, w, e, e'"""
-DIGEST = 16
+DIGEST_MAX = 16
 """most samples of peers that a message carries"""
 ROW = 22
 """floats of a `Neighbour`: p^ 3, v^ 3, d_ij 3, in formation, shares the avoidance, uncertainty, lost, last seen 3,
@@ -149,7 +149,7 @@ class State(NamedTuple):
     """(delay + 1, N, SAMPLE)"""
     ring_step: Ints
     ring_digest: Floats
-    """(delay + 1, N, DIGEST, SAMPLE)"""
+    """(delay + 1, N, samples of peers in a message, SAMPLE)"""
     ring_digest_step: Ints
     ring_digest_id: Ints
     outage: Flags
@@ -170,10 +170,9 @@ class State(NamedTuple):
     events: Ints
     """(most, 2): step, agent"""
     counts: Ints
-    """[number of events, bytes' samples sent, mode steps dynamic, mode steps fixed, filter active]"""
+    """[number of events, bytes' samples sent, mode steps dynamic, mode steps fixed]"""
     record: Floats
     """(steps kept, N, 6)"""
-    record_u: Floats
 
 
 MEASURES = (

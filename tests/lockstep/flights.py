@@ -76,7 +76,7 @@ def launch(
     """A fleet that has just accepted its take-off."""
     ls = Lockstep(config, seed=seed, network=network or NetworkParameters(), record=record)
     ls.run_until(READY_S)
-    ls.run_until(READY_S + 10.0, lambda: not any(v.agent.operator.unready(ls.now) for v in ls.vehicles.values()))
+    ls.run_until_ready(READY_S + 10.0)
     answers = [json.loads(a) for a in ls.command(b'{"verb":"takeoff"}').values()]
     assert all(a["accepted"] for a in answers), answers
     return ls

@@ -28,6 +28,10 @@ def test_a_compiled_flight_is_the_same_to_the_last_digit_and_note(tmp_path: Path
     assert flown(tmp_path / "compiled") == flown(ROOT)
 
 
+def test_every_module_that_is_to_be_compiled_is_there() -> None:
+    assert [module for module in MODULES if not (ROOT / module).is_file()] == []
+
+
 def test_a_compiled_copy_is_made_in_a_new_folder_alone(tmp_path: Path) -> None:
     with pytest.raises(CompanionError, match="exists already; name a new folder"):
         build(tmp_path)

@@ -605,7 +605,7 @@ def test_an_estimator_that_says_nothing_any_more_counts_as_uncertain() -> None:
 def test_a_position_that_jumps_on_the_ground_is_no_failsafe_in_the_air(when: str) -> None:
     # PX4's estimator resets its position on the ground, seconds before it may be armed.
     ls = Lockstep(fleet(2), seed=8)
-    ls.run_until(10.0, lambda: not any(v.agent.operator.unready(ls.now) for v in ls.vehicles.values()))
+    ls.run_until_ready(10.0)
     s = Scene(ls, [])
     if when == "armed on the ground":
         ls.command(b'{"verb":"takeoff"}')

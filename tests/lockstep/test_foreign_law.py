@@ -1,7 +1,11 @@
 """A law and a trigger of another package fly as ours do, and what they do wrong ends nothing."""
 
+import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from importlib.metadata import distributions
 from math import dist, inf, nan
 from pathlib import Path
 from typing import Any
@@ -28,6 +32,30 @@ def springs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(site))
         yield site
+
+
+def test_a_wheel_of_the_example_brings_what_the_tests_fly(springs: Path, tmp_path: Path) -> None:
+    source = shutil.copytree(EXAMPLE, tmp_path / "source", ignore=shutil.ignore_patterns("build", "*.egg-info"))
+    pip, offline = [sys.executable, "-m", "pip", "-q"], ["--no-deps", "--no-index"]
+    wheel = ["wheel", *offline, "--no-build-isolation", "-w", str(tmp_path), str(source)]
+    built = subprocess.run([*pip, *wheel], capture_output=True, text=True, check=False)
+    assert built.returncode == 0, built.stdout + built.stderr
+    (made,) = tmp_path.glob("*.whl")
+    subprocess.run(
+        [*pip, "install", *offline, "--no-compile", "--target", str(tmp_path / "site"), str(made)], check=True
+    )
+    installed, flown = (
+        {(d.name, d.version): d for d in distributions(path=[str(s)])} for s in (tmp_path / "site", springs)
+    )
+    assert installed.keys() == flown.keys() == {("starling-springs", "0.1.0")}
+    for name, of in installed.items():
+        assert {(e.group, e.name, e.value) for e in of.entry_points} == {
+            (e.group, e.name, e.value) for e in flown[name].entry_points
+        }
+    package = "starling_springs"
+    assert {p.name: p.read_bytes() for p in (tmp_path / "site" / package).glob("*.py")} == {
+        p.name: p.read_bytes() for p in (springs / package).glob("*.py")
+    }
 
 
 def foreign(tables: dict[str, Any]) -> None:

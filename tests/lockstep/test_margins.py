@@ -15,7 +15,7 @@ def flown(command_delay_s: float, lag_s: float) -> tuple[float, float]:
         tables["stub"]["lag_s"] = lag_s
 
     ls = Lockstep(fleet(4, legs=straight(30.0), change=change), seed=3, command_delay_s=command_delay_s)
-    ls.run_until(20.0, lambda: not any(v.agent.operator.unready(ls.now) for v in ls.vehicles.values()))
+    ls.run_until_ready(20.0)
     ls.command(b'{"verb":"takeoff"}')
     until_formed(ls)
     wait(ls, 20.0)

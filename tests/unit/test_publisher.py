@@ -27,7 +27,7 @@ from companion.wire.peer import decode_state
 CONFIG = load(Path(__file__).resolve().parents[2] / "fleet.toml", lambda t: t.update(vehicle=t["vehicle"][:3]))
 UTC_NS = 1_790_000_000_000_000_000
 TICK_NS = 20_000_000
-T_MAX_S = CONFIG.message_spacing.t_max_s
+T_MAX_S = CONFIG.trigger.t_max_s
 
 
 def at(monotonic_ns: int) -> Instant:

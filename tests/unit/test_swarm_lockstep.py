@@ -12,7 +12,8 @@ pytest.importorskip("numba")
 from companion.config import load
 from companion.core.values import Phase
 from sim.lockstep.lockstep import UTC_AT_START_NS, Lockstep
-from sim.swarm.swarm import Formation, Run, Setup, run
+from sim.swarm.setup import Formation, Setup
+from sim.swarm.swarm import Run, run
 
 FLEET = Path(__file__).resolve().parents[2] / "fleet.toml"
 COUNT = 4

@@ -7,14 +7,13 @@ import pytest
 
 from companion.core.monitor import PeerMotion, prediction_error_bound_m, unheard_error_m
 from companion.core.prediction import HoldKind, axis, weights
-from companion.core.trigger.base import Situation, Spacing, Trigger
+from companion.core.trigger.base import Situation, Trigger
 from companion.core.trigger.error import RAISED_MAX_M, ErrorTrigger, exceeds
 from companion.core.trigger.periodic import PeriodicTrigger
 from companion.core.trigger.switching import SwitchingTrigger, switching_exceeds, switching_threshold
 
 TRIGGER = ErrorTrigger(epsilon_m=0.5, gamma_s2=0.25, kappa=0.5)
 SWITCHING = SwitchingTrigger(gamma_s2=0.5, alpha=0.75, beta=0.5, delta_min=0.25, delta_f=0.0625, eta=0.5)
-SPACING = Spacing(t_min_s=0.0625, t_max_s=8.0)
 
 MOTION = PeerMotion(
     sigma_p_m=0.0, sigma_v_m_s=0.0, sigma_gust_m_s2=0.0, a_max_m_s2=5.0, deviation_m_s2=12.0, drift_m_s=0.0,
@@ -76,29 +75,15 @@ def test_switching_trigger_at_its_thresholds(error_p2: float, error_v2: float, t
     assert switching_exceeds(error_p2, error_v2, t_s, SWITCHING) is fires
 
 
-@pytest.mark.parametrize(
-    ("since_s", "silence_limit_s", "fired", "sends"),
-    [
-        (below(0.0625), 8.0, True, False),  # t_min holds even a fired one back
-        (0.0625, 8.0, True, True),
-        (0.0625, 8.0, False, False),
-        (below(6.5), 6.5, False, False),  # the jittered T_max
-        (6.5, 6.5, False, True),
-        (0.0, 8.0, True, False),
-    ],
-)
-def test_spacing_between_messages(since_s: float, silence_limit_s: float, fired: bool, sends: bool) -> None:
-    assert SPACING.decide(since_s, silence_limit_s, fired) is sends
-
-
 def fly(
-    seed: int, kind: HoldKind, trigger: ErrorTrigger, spacing: Spacing, delay_ticks: int
+    seed: int, kind: HoldKind, trigger: ErrorTrigger, spacing_s: tuple[float, float], delay_ticks: int
 ) -> tuple[float, float, int]:
     """A vehicle pushed about at up to 2 m/s^2 on a plan at 1 m/s, and one receiver of its messages.
 
     Returns the largest squared trigger error just after a decision, the largest position error of the receiver over
-    the whole flight, and the number of messages. One axis, 20 ms ticks, 60 s.
+    the whole flight, and the number of messages. One axis, 20 ms ticks, 60 s; `spacing_s` is t_min and T_max.
     """
+    t_min_s, t_max_s = spacing_s
     rng = random.Random(seed)
     dt = 0.02
     p, v = 0.0, 1.0
@@ -120,7 +105,8 @@ def fly(
         while under_way and under_way[0][0] <= k:
             received = under_way.pop(0)[1]
         q, w = held(sent, t)
-        if spacing.decide(t - sent[0] + 1e-9, spacing.t_max_s, exceeds((p - q) ** 2, (v - w) ** 2, 0.0, trigger)):
+        since_s, fired = t - sent[0] + 1e-9, exceeds((p - q) ** 2, (v - w) ** 2, 0.0, trigger)
+        if since_s >= t_max_s or (fired and since_s >= t_min_s):
             sent = (t, p, v)
             messages += 1
             under_way.append((k + delay_ticks, sent))
@@ -139,7 +125,7 @@ KINDS: tuple[HoldKind, ...] = ("damped", "zero", "first")
 @pytest.mark.parametrize("seed", range(3))
 def test_receiver_prediction_error_stays_below_trigger_threshold(kind: HoldKind, seed: int) -> None:
     trigger = ErrorTrigger(0.3, 0.1, 0.0)
-    worst, at_receiver, messages = fly(seed, kind, trigger, Spacing(0.02, 10.0), 0)
+    worst, at_receiver, messages = fly(seed, kind, trigger, (0.02, 10.0), 0)
     assert worst < 0.3**2
     assert at_receiver < 0.3
     assert 10 < messages < 3000
@@ -148,13 +134,13 @@ def test_receiver_prediction_error_stays_below_trigger_threshold(kind: HoldKind,
 @pytest.mark.parametrize("seed", range(3))
 def test_with_delay_and_spacing_the_receiver_stays_within_the_stated_bound(seed: int) -> None:
     trigger = ErrorTrigger(0.3, 0.1, 0.0)
-    _, at_receiver, _ = fly(seed, "damped", trigger, Spacing(0.06, 10.0), 4)
+    _, at_receiver, _ = fly(seed, "damped", trigger, (0.06, 10.0), 4)
     bound = prediction_error_bound_m(0.3, 0.1, MOTION._replace(a_max_m_s2=2.0, latency_s=0.02 + 0.08 + 0.06))
     assert 0.3 < at_receiver <= bound
 
 
 def test_a_silent_vehicle_still_speaks_every_t_max() -> None:
-    _, _, messages = fly(0, "damped", ErrorTrigger(1e6, 0.1, 0.0), Spacing(0.02, 2.0), 0)
+    _, _, messages = fly(0, "damped", ErrorTrigger(1e6, 0.1, 0.0), (0.02, 2.0), 0)
     assert messages == pytest.approx(30, abs=1)
 
 

@@ -83,10 +83,6 @@ def motion_order(revision: int, start_ns: int, issuer: int) -> tuple[int, int, i
     return (revision, -start_ns, issuer)
 
 
-REVISIONS = 1 << 32
-"""a motion's revision is below this, as it travels"""
-
-
 @dataclass(frozen=True)
 class FleetTrajectory:
     """The fleet's motion from `start_ns` on: immutable, the same bytes on every vehicle."""

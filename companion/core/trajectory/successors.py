@@ -15,6 +15,7 @@ from companion.core.trajectory.goto import goto_leg
 from companion.core.trajectory.legs import TURN_RAMP_S, GotoLeg, Leg, VelocityLeg
 from companion.core.trajectory.slots import SlotChange, blend_duration_s
 from companion.core.values import ZERO
+from companion.core.vectors import lerp
 
 PAD_TOLERANCE_M = 0.05
 
@@ -65,7 +66,7 @@ def with_formation(
     """
     m = motion.state_at(at_ns).blend[0]
     ids = sorted(motion.slots)
-    before = [Ned(*(a + m * (b - a) for a, b in zip(*motion.slots[i], strict=True))) for i in ids]
+    before = [lerp(*motion.slots[i], m) for i in ids]
     order = assign(before, slots, _rows(ids, pinned))
     changes = [SlotChange(a, slots[k]) for a, k in zip(before, order, strict=True)]
     return replace(
@@ -101,11 +102,10 @@ def with_return(
     stopped = with_legs(motion, at_ns=at_ns, issuer=issuer, legs=(VelocityLeg(ZERO, 0.0),))
     c, s = cos(stopped.state_at(far).heading_rad), sin(stopped.state_at(far).heading_rad)
     slots = {}
-    for i, (a, b) in motion.slots.items():
+    for i, change in motion.slots.items():
         pad = home.reference(i, 0).position_ned_m
         north, east, down = (x - y for x, y in zip(pad, centre, strict=True))
-        before = Ned(*(x + here.blend[0] * (y - x) for x, y in zip(a, b, strict=True)))
-        slots[i] = SlotChange(before, Ned(c * north + s * east, c * east - s * north, down))
+        slots[i] = SlotChange(lerp(*change, here.blend[0]), Ned(c * north + s * east, c * east - s * north, down))
     flight = goto_leg(here.centre.position, here.centre.velocity, centre, speed_m_s, climb_m_s, descent_m_s)
     seconds = max(blend_duration_s(list(slots.values()), speed_m_s, climb_m_s, descent_m_s), flight.duration_s)
     return replace(

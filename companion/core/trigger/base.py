@@ -59,14 +59,3 @@ class Trigger(Protocol):
     def cause(self) -> str:
         """The keys of fleet.toml that the bound comes from, with their values, for messages."""
         ...
-
-
-class Spacing(NamedTuple):
-    """Bounds on the time between two messages, for every trigger."""
-
-    t_min_s: float
-    t_max_s: float
-
-    def decide(self, since_last_s: float, silence_limit_s: float, fired: bool) -> bool:
-        """Whether to send now; silence_limit_s is the jittered T_max, so that heartbeats do not bunch."""
-        return since_last_s >= silence_limit_s or (fired and since_last_s >= self.t_min_s)
