@@ -53,8 +53,8 @@ def mode_name(custom_mode: int) -> str:
 
 def parameter_value(raw: bytes, kind: int) -> float | int:
     """Value of a PARAM_VALUE from its four bytes: PX4 puts an INT32 bytewise into the float."""
-    (value,) = struct.unpack("<i" if kind == PARAMETER_INT32 else "<f", raw)
-    return int(value) if kind == PARAMETER_INT32 else float(value)
+    value: float | int = struct.unpack("<i" if kind == PARAMETER_INT32 else "<f", raw)[0]
+    return value
 
 
 def arm_parameters(arm: bool) -> tuple[int, float]:
