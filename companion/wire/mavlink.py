@@ -33,6 +33,8 @@ NO_AUTOPILOT = 8
 """MAV_AUTOPILOT_INVALID"""
 ARMED = 128
 """bit of HEARTBEAT.base_mode"""
+ON_GROUND = 1
+"""MAV_LANDED_STATE; 0 is unknown"""
 PLAUSIBLE_MAX = 1e6
 """no position (m) or velocity (m/s) is larger than this: float32 holds far more, and squares of it overflow later"""
 UTC_KNOWN_US = 1_577_836_800_000_000
@@ -77,7 +79,7 @@ class CurrentMode(NamedTuple):
 
 
 class LandedState(NamedTuple):
-    """EXTENDED_SYS_STATE (245): 1 on ground, 2 in air, 3 taking off, 4 landing."""
+    """EXTENDED_SYS_STATE (245): 0 unknown, ON_GROUND, 2 in air, 3 taking off, 4 landing."""
 
     state: int
 

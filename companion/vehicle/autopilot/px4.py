@@ -38,8 +38,6 @@ from companion.wire.mavlink import MavlinkCodec
 from companion.wire.px4 import Px4Mode, mode_name
 
 CLOCK_SAMPLES = 5
-ON_GROUND = 1
-"""EXTENDED_SYS_STATE's landed state; 0 is unknown"""
 FLAGS_NEEDED = 1 | 2 | 4
 """ESTIMATOR_STATUS: attitude, horizontal and vertical velocity"""
 GLOBAL_FLAG, RELATIVE_FLAG = 16, 8
@@ -329,7 +327,7 @@ class Px4Autopilot:
     @property
     def on_ground(self) -> bool | None:
         """Whether it stands on the ground; None while it does not tell."""
-        return None if self.landed_state == 0 else self.landed_state == ON_GROUND
+        return None if self.landed_state == 0 else self.landed_state == wire.ON_GROUND
 
     @property
     def rejected(self) -> Counter[str]:
