@@ -54,7 +54,6 @@ class Heartbeat(NamedTuple):
     vehicle_type: int
     armed: bool
     custom_mode: int
-    system_status: int
 
 
 class LocalPosition(NamedTuple):
@@ -90,7 +89,6 @@ class EstimatorHealth(NamedTuple):
     flags: int
     horizontal_accuracy_m: float
     """infinite where none is told"""
-    vertical_accuracy_m: float
 
 
 class SystemHealth(NamedTuple):
@@ -245,13 +243,13 @@ class MavlinkCodec:
         return None
 
     def _heartbeat(
-        self, custom_mode: int, vehicle_type: int, autopilot: int, base_mode: int, status: int, _version: int
+        self, custom_mode: int, vehicle_type: int, autopilot: int, base_mode: int, _status: int, _version: int
     ) -> Heartbeat | None:
         if autopilot == NO_AUTOPILOT:
             # A camera or a ground station with the autopilot's ids: it would disarm the vehicle in our eyes.
             self.rejected["heartbeat of no autopilot"] += 1
             return None
-        return Heartbeat(autopilot, vehicle_type, bool(base_mode & ARMED), custom_mode, status)
+        return Heartbeat(autopilot, vehicle_type, bool(base_mode & ARMED), custom_mode)
 
     def _global_origin(self, latitude: int, longitude: int, altitude: int) -> GlobalOrigin | None:
         unset = latitude == 0 and longitude == 0
@@ -312,9 +310,9 @@ def _landed_state(_vtol_state: int, landed_state: int) -> LandedState:
 
 
 def _estimator_status(_time_us: int, *fields: Any) -> EstimatorHealth:
-    *_ratios, horizontal_m, vertical_m, flags = fields
+    *_ratios, horizontal_m, _vertical_m, flags = fields
     # No estimate is exact: what is not above 0 was never filled in.
-    return EstimatorHealth(flags, *(x if 0.0 < x < inf else inf for x in (horizontal_m, vertical_m)))
+    return EstimatorHealth(flags, horizontal_m if 0.0 < horizontal_m < inf else inf)
 
 
 def _system_status(_present: int, _enabled: int, health: int, *fields: int) -> SystemHealth:

@@ -45,7 +45,6 @@ class Vehicle:
     autopilot: Autopilot
     alive: bool = True
     """whether the companion runs"""
-    truth_gap_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -91,7 +91,7 @@ class Px4Autopilot:
         self.battery_percent = -1
         self.sensors_health = 0
         self.home_altitude_amsl_m: float | None = None
-        self.estimator = wire.EstimatorHealth(0, inf, inf)
+        self.estimator = wire.EstimatorHealth(0, inf)
         self.estimator_ns: int | None = None
         """when ESTIMATOR_STATUS last came (monotonic ns)"""
         self.health_ns: int | None = None
