@@ -168,9 +168,7 @@ class Px4Autopilot:
 
     def _set_up(self) -> None:
         """Ask for what we read, and for no more: a companion's link may be a serial line."""
-        streams = {**px4.STREAMS_HZ, px4.POSITION_MESSAGE_ID: self.config.limits.control_rate_hz}
-        streams |= dict.fromkeys(px4.STREAMS_OFF, 0.0)
-        for message_id, rate_hz in streams.items():
+        for message_id, rate_hz in px4.streams_hz(self.config.limits.control_rate_hz).items():
             self.requests.ask(f"{STREAM} {message_id}", *px4.interval_parameters(message_id, rate_hz))
 
     def _position(self, message: wire.LocalPosition, now: Instant) -> bool:
