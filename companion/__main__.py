@@ -39,10 +39,11 @@ def run(
     Exit status: 0 ended with the vehicle landed or landing, 2 wrong usage or configuration, 3 ended while the autopilot
     had not confirmed landing, 4 could do nothing any more (a fault of ours; the autopilot's failsafe has the vehicle).
     """
-    from companion.config import load
+    from companion.config.file import parse_text, read_text
     from companion.io.process import fly_vehicle
 
-    config, text = load(fleet), fleet.read_text(encoding="utf-8")
+    text = read_text(fleet)
+    config = parse_text(text, fleet)
     stop_fd = sys.stdin.fileno() if launched else None
     raise typer.Exit(fly_vehicle(config, vehicle, fleet, text, record=record, stop_fd=stop_fd))
 

@@ -13,6 +13,7 @@ import typer
 from companion.errors import CompanionError, ConfigError
 from companion.operator import verbs
 from companion.operator.verbs import FAILED, FLEET_TOML, FleetFile, Vehicles
+from sim.autopilot.faults import Fault, FaultKind
 
 app = typer.Typer(
     no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
@@ -26,10 +27,6 @@ Parameters = Annotated[
 CROWD_PER_CORE = 8
 CROWD_RATE_HZ = 20.0
 """the control rate of a fleet whose companions share one machine, more than CROWD_PER_CORE to each of its cores"""
-FAULTS = (
-    "gps_lost", "position_frozen", "estimator_reset", "noise", "low_battery", "reboot", "mute", "pilot_takeover",
-    "pilot_sticks", "rc_kill", "slow_link",
-)  # fmt: skip
 
 
 @app.command()
@@ -168,7 +165,7 @@ def stub(
 @app.command()
 def fault(
     vehicle: Annotated[int, typer.Argument(min=1, max=250, help="The vehicle's id.")],
-    kind: Annotated[str, typer.Argument(help=", ".join(FAULTS))],
+    kind: Annotated[str, typer.Argument(help=", ".join(FaultKind))],
     magnitude: Annotated[float | None, typer.Option(min=0, help="Strength, in the fault's own unit.")] = None,
     duration: Annotated[
         float | None, typer.Option("--for", min=0, help="Seconds that a lasting fault lasts; 0 ends it.")
@@ -178,11 +175,10 @@ def fault(
 ) -> None:
     """Have a stub autopilot of a running fleet suffer a fault; exit status 1 if it does not answer."""
     from companion.config.overrides import fleet_config
-    from sim.autopilot.faults import Fault, FaultKind
     from sim.launch.faults import order_fault
 
-    if kind not in FAULTS:
-        raise ConfigError(f"fault must be one of {', '.join(FAULTS)}, got {kind!r}")
+    if kind not in tuple(FaultKind):
+        raise ConfigError(f"fault must be one of {', '.join(FaultKind)}, got {kind!r}")
     config = fleet_config(fleet, vehicles)
     order_fault(config, vehicle, Fault(FaultKind(kind), magnitude, float("inf") if duration is None else duration))
     typer.echo(f"vehicle {vehicle}: {kind}")

@@ -24,15 +24,32 @@ def load(path: Path, change: Callable[[dict[str, Any]], None] | None = None) -> 
 
 def read_tables(path: Path, change: Callable[[dict[str, Any]], None] | None = None) -> dict[str, Any]:
     """The raw tables of a TOML file, edited by `change`."""
-    try:
-        tables = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: is not valid TOML: {error}") from error
+    tables = _tables(read_text(path), path)
     if change is not None:
         change(tables)
     return tables
+
+
+def read_text(path: Path) -> str:
+    """What a file holds; ConfigError if it cannot be read."""
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: is not valid TOML: {error}") from error
+
+
+def parse_text(text: str, path: Path) -> FleetConfig:
+    """Validate what the file `path` holds: for whoever keeps the text too, which is then the one that was validated."""
+    return parse(_tables(text, path), path.name)
+
+
+def _tables(text: str, path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path}: is not valid TOML: {error}") from error
 
 
 def parse(tables: Mapping[str, Any], name: str) -> FleetConfig:

@@ -35,10 +35,7 @@ class Inbox:
 
     def put_sample(self, key: str, payload: bytes | None, received_ns: int) -> None:
         """A peer's sample; None for a payload that is no sample's (too large, a deletion)."""
-        vehicle_id = vehicle_id_of(key)
-        if vehicle_id == self._vehicle_id:
-            self.count("own_id_heard")
-        if vehicle_id is None or payload is None or len(payload) > PAYLOAD_MAX_BYTES:
+        if vehicle_id_of(key) is None or payload is None or len(payload) > PAYLOAD_MAX_BYTES:
             self.count("malformed")
         else:
             self._put(key.rpartition("/")[2], ReceivedSample(key, payload, received_ns))
@@ -71,7 +68,7 @@ class Inbox:
             self._mailbox.put(kind, item)
         self._wake()
 
-    def count(self, what: Literal["malformed", "own_id_heard", "publish_failures", "reply_failures"]) -> None:
+    def count(self, what: Literal["malformed", "publish_failures", "reply_failures"]) -> None:
         """One more of a field of `TransportCounters`."""
         with self._lock:
             setattr(self._counters, what, getattr(self._counters, what) + 1)

@@ -27,7 +27,7 @@ from companion.io.clock import FleetClock
 from companion.io.link import open_link
 from companion.io.network import peer_transport
 from companion.io.recorder import Recorder
-from companion.io.records import TickRecord, TrafficRecord
+from companion.io.records import TickRecord, TrafficRecord, peer_body
 from companion.io.systemd import Notifier
 from companion.io.transport import Connect, PresenceChange, ReceivedSample, Request
 from companion.vehicle.agent import Agent
@@ -186,7 +186,7 @@ class Companion:
             now = self._instant(event.received_monotonic_ns)
             match event:
                 case ReceivedSample():
-                    self._record("input/peer", now, event.key.encode() + b"\0" + event.payload)
+                    self._record("input/peer", now, peer_body(event.key, event.payload))
                     self.guard.receive_peer(event.key, event.payload, now)
                 case PresenceChange():
                     self._record("input/presence", now, bytes((event.vehicle_id, event.alive)))
@@ -267,7 +267,7 @@ class Companion:
         for datagram in out.mavlink:
             self._record("output/mavlink", now, datagram)
         for topic, payload in out.peers:
-            self._record("output/peer", now, topic.encode() + b"\0" + payload)
+            self._record("output/peer", now, peer_body(topic, payload))
         for event in out.events:
             self._record("event", now, encode_event(event))
         for note in out.notes:

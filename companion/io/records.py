@@ -1,4 +1,4 @@
-"""What the loop itself records beside the agent's inputs and outputs: each tick's figures, and the traffic."""
+"""Bodies of recorded entries: what the loop itself records (each tick's figures, the traffic), and peers' messages."""
 
 import struct
 from typing import NamedTuple, Self
@@ -52,3 +52,14 @@ class TrafficRecord(NamedTuple):
     def unpack(cls, body: bytes) -> Self:
         """From a recording; struct.error if it is none."""
         return cls(*TRAFFIC.unpack(body))
+
+
+def peer_body(name: str, payload: bytes) -> bytes:
+    """Body of the "input/peer" channel (`name`: the key) and of "output/peer" (its topic)."""
+    return name.encode() + b"\0" + payload
+
+
+def split_peer_body(body: bytes) -> tuple[str, bytes]:
+    """Name and payload from a recording; UnicodeDecodeError if it is none."""
+    name, _, payload = body.partition(b"\0")
+    return name.decode(), payload

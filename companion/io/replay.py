@@ -11,6 +11,7 @@ from companion.core.failsafe import Failsafe
 from companion.core.values import Instant
 from companion.errors import CompanionError
 from companion.io.recorder import Entry, Gap, Recording, RecordingError, gap_between, read_recording
+from companion.io.records import peer_body, split_peer_body
 from companion.vehicle.agent import Agent
 from companion.vehicle.guard import Guard
 
@@ -131,7 +132,7 @@ def _advance(guard: Guard, _: bytes, now: Instant) -> Iterator[tuple[str, bytes]
     for datagram in out.mavlink:
         yield "output/mavlink", datagram
     for topic, payload in out.peers:
-        yield "output/peer", topic.encode() + b"\0" + payload
+        yield "output/peer", peer_body(topic, payload)
 
 
 def _mavlink(guard: Guard, body: bytes, now: Instant) -> Iterator[tuple[str, bytes]]:
@@ -140,8 +141,7 @@ def _mavlink(guard: Guard, body: bytes, now: Instant) -> Iterator[tuple[str, byt
 
 
 def _peer(guard: Guard, body: bytes, now: Instant) -> Iterator[tuple[str, bytes]]:
-    key, _, payload = body.partition(b"\0")
-    guard.receive_peer(key.decode(), payload, now)
+    guard.receive_peer(*split_peer_body(body), now)
     return iter(())
 
 

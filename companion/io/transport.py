@@ -77,8 +77,6 @@ class TransportCounters:
     """events that the loop was too slow to take, oldest first"""
     malformed: int = 0
     """samples with a foreign key, a deletion, or an oversized payload"""
-    own_id_heard: int = 0
-    """samples that somebody else published under this vehicle's id"""
     publish_failures: int = 0
     reply_failures: int = 0
 

@@ -225,7 +225,7 @@ class Agent:
 
     def _tick(self, now: Instant) -> None:
         """One control tick, from the newest position to the setpoint and what the peers are told."""
-        came, dt_s = self._begin(now)
+        dt_s = self._begin(now)
         measured = self.supervisor.state(now)
         self._supervise(measured is not None, now)
         if measured is None:
@@ -246,18 +246,18 @@ class Agent:
         self.supervisor.settle(ego, reference, now)
         self.plans.propose(now)
         self._publish(reference, residual, now)
-        self._report_tick(ego, reference, neighbours, came, setpoint is not None, now)
+        self._report_tick(ego, reference, neighbours, setpoint is not None)
 
     # -- the stages ----------------------------------------------------------------------------------------------------
 
-    def _begin(self, now: Instant) -> tuple[bool, float]:
-        """Whether a position drives this tick, and the time since the one before (s; 0 for the first)."""
-        came, self._position_came = self._position_came, False
+    def _begin(self, now: Instant) -> float:
+        """The time since the tick before (s; 0 for the first)."""
+        self._position_came = False
         dt_s = 0.0 if self._ticked_ns is None else (now.monotonic_ns - self._ticked_ns) * 1e-9
         self._ticked_ns = now.monotonic_ns
         if dt_s > LATE_S and self.supervisor.steers:
             self.rejected[Failsafe.LOOP_LATE.value] += 1
-        return came, dt_s
+        return dt_s
 
     def _supervise(self, positioned: bool, now: Instant) -> None:
         """Lead the autopilot from phase to phase and act on failsafes; a new phase is announced."""
@@ -312,18 +312,14 @@ class Agent:
             self._publish(self.history.reference(self.id, now.fleet_ns), ZERO, now)
 
     def _report_tick(
-        self, ego: VehicleState, reference: Reference, neighbours: Sequence[Neighbour], came: bool, steered: bool,
-        now: Instant,
-    ) -> None:  # fmt: skip
+        self, ego: VehicleState, reference: Reference, neighbours: Sequence[Neighbour], steered: bool
+    ) -> None:
         """Report what this tick did."""
         here = ego.position_ned_m
         self._last_tick = self._outputs.tick = TickReport(
-            now,
-            came,
             dist(here, reference.position_ned_m),
             sum([n.in_formation for n in neighbours]),
             min([dist(n.position_ned_m, here) for n in neighbours], default=-1.0),
-            self.safety.acceleration_m_s2,
             steered,
             here,
             ego.velocity_ned_m_s,

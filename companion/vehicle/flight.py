@@ -70,10 +70,13 @@ class Flight:
     @property
     def stopped_low(self) -> bool:
         """Whether a climb has ended in hold mode below the altitude of take-off, before the autopilot is engaged."""
-        low_m = self.config.formation.altitude_m - HOLD_MARGIN_M
-        below = self.config.fleet.frame == "global" and -self.autopilot.position_ned_m.down < low_m
-        holds = self.autopilot.mode == HOLD and self.engaging_since_ns is None
-        return self.phase is Phase.CLIMBING and self.positioned and holds and below
+        autopilot = self.autopilot
+        return (
+            self.phase is Phase.CLIMBING and self.positioned
+            and autopilot.mode == HOLD and self.engaging_since_ns is None
+            and self.config.fleet.frame == "global"
+            and -autopilot.position_ned_m.down < self.config.formation.altitude_m - HOLD_MARGIN_M
+        )  # fmt: skip
 
     def observe(self, now: Instant, positioned: bool) -> bool:
         """Take what several detectors go by; whether the position has jumped since the last tick that took a jump."""

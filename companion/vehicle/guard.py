@@ -85,11 +85,7 @@ class Guard:
 
     def reply(self, kind: str, answer: Callable[[], bytes]) -> bytes | None:
         """An answer to a question of that kind, or None: whoever asked asks again."""
-        try:
-            return answer()
-        except Exception as error:  # noqa: BLE001 - the one place that catches whatever comes
-            self._count(kind, error)
-            return None
+        return self._guarded(kind, answer, None)
 
     def next_deadline_ns(self) -> int:
         """`Agent.next_deadline_ns`, but no sooner than a tick that raised may be tried again."""

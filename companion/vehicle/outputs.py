@@ -4,24 +4,18 @@ from dataclasses import dataclass, field
 
 from companion.core.events import Event, sentence
 from companion.core.frames import Ned
-from companion.core.values import Instant
 
 
 @dataclass(slots=True)
 class TickReport:
     """What one control tick did, for the recording and the live table."""
 
-    time: Instant
-    driven_by_position: bool
-    """whether a new position made it due, rather than the time since the last tick"""
     position_error_m: float
     """distance from the own slot"""
     neighbours: int
     """in formation"""
     nearest_m: float
     """distance of the nearest peer; -1 without one"""
-    acceleration_m_s2: tuple[float, float]
-    """flown: north, east"""
     steered: bool
     """whether a setpoint was sent"""
     position_ned_m: Ned

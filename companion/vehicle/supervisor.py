@@ -63,7 +63,9 @@ class Supervisor:
         self._restart_filter = restart_filter
         """the safety filter forgets what was flown before"""
         self._pending = PendingCommands(autopilot, self.events)
-        self._detectors = tuple(kind() for kind in DETECTORS)
+        detectors = [kind() for kind in DETECTORS]
+        self._detectors = {phase: tuple(d for d in detectors if phase in d.phases) for phase in Phase}
+        """who is asked in a phase, in the order of DETECTORS"""
         self._follower = Follower(self.flight, self._happened)
         self._falls = FallWatch()
 
@@ -253,11 +255,13 @@ class Supervisor:
 
     def _detect(self, now: Instant) -> None:
         """Have the detectors look, and act on what they find until the phase changes."""
-        flight, phase = self.flight, self.phase
-        for detector in self._detectors:
-            if phase not in detector.phases or (detector.needs_position and flight.blind):
+        flight, phase, blind = self.flight, self.phase, self.flight.blind
+        for detector in self._detectors[phase]:
+            if blind and detector.needs_position:
                 continue
             match detector.look(flight, now):
+                case None:
+                    pass
                 case Note(detail):
                     self.counts[detector.failsafe.value] += 1
                     self.events.append(FailsafeNoted(detector.failsafe, detail))

@@ -33,6 +33,8 @@ NO_AUTOPILOT = 8
 """MAV_AUTOPILOT_INVALID"""
 ARMED = 128
 """bit of HEARTBEAT.base_mode"""
+ON_GROUND = 1
+"""MAV_LANDED_STATE; 0 is unknown"""
 PLAUSIBLE_MAX = 1e6
 """no position (m) or velocity (m/s) is larger than this: float32 holds far more, and squares of it overflow later"""
 UTC_KNOWN_US = 1_577_836_800_000_000
@@ -52,7 +54,6 @@ class Heartbeat(NamedTuple):
     vehicle_type: int
     armed: bool
     custom_mode: int
-    system_status: int
 
 
 class LocalPosition(NamedTuple):
@@ -77,7 +78,7 @@ class CurrentMode(NamedTuple):
 
 
 class LandedState(NamedTuple):
-    """EXTENDED_SYS_STATE (245): 1 on ground, 2 in air, 3 taking off, 4 landing."""
+    """EXTENDED_SYS_STATE (245): 0 unknown, ON_GROUND, 2 in air, 3 taking off, 4 landing."""
 
     state: int
 
@@ -88,7 +89,6 @@ class EstimatorHealth(NamedTuple):
     flags: int
     horizontal_accuracy_m: float
     """infinite where none is told"""
-    vertical_accuracy_m: float
 
 
 class SystemHealth(NamedTuple):
@@ -243,13 +243,13 @@ class MavlinkCodec:
         return None
 
     def _heartbeat(
-        self, custom_mode: int, vehicle_type: int, autopilot: int, base_mode: int, status: int, _version: int
+        self, custom_mode: int, vehicle_type: int, autopilot: int, base_mode: int, _status: int, _version: int
     ) -> Heartbeat | None:
         if autopilot == NO_AUTOPILOT:
             # A camera or a ground station with the autopilot's ids: it would disarm the vehicle in our eyes.
             self.rejected["heartbeat of no autopilot"] += 1
             return None
-        return Heartbeat(autopilot, vehicle_type, bool(base_mode & ARMED), custom_mode, status)
+        return Heartbeat(autopilot, vehicle_type, bool(base_mode & ARMED), custom_mode)
 
     def _global_origin(self, latitude: int, longitude: int, altitude: int) -> GlobalOrigin | None:
         unset = latitude == 0 and longitude == 0
@@ -310,9 +310,9 @@ def _landed_state(_vtol_state: int, landed_state: int) -> LandedState:
 
 
 def _estimator_status(_time_us: int, *fields: Any) -> EstimatorHealth:
-    *_ratios, horizontal_m, vertical_m, flags = fields
+    *_ratios, horizontal_m, _vertical_m, flags = fields
     # No estimate is exact: what is not above 0 was never filled in.
-    return EstimatorHealth(flags, *(x if 0.0 < x < inf else inf for x in (horizontal_m, vertical_m)))
+    return EstimatorHealth(flags, horizontal_m if 0.0 < horizontal_m < inf else inf)
 
 
 def _system_status(_present: int, _enabled: int, health: int, *fields: int) -> SystemHealth:

@@ -12,9 +12,8 @@ PARAMETER_INT32, PARAMETER_REAL32 = 6, 9
 """MAV_PARAM_TYPE"""
 ORIGIN_MESSAGE_ID = 49
 POSITION_MESSAGE_ID = 32
-POSITION_RATE_HZ = 50.0
-STREAMS_HZ = {POSITION_MESSAGE_ID: POSITION_RATE_HZ, 436: 20.0, 245: 5.0, 230: 1.0, 1: 1.0, 2: 1.0, 242: 0.5}
-"""what the companion asks for with SET_MESSAGE_INTERVAL"""
+STREAMS_HZ = {436: 20.0, 245: 5.0, 230: 1.0, 1: 1.0, 2: 1.0, 242: 0.5}
+"""what the companion asks for with SET_MESSAGE_INTERVAL, beside the positions"""
 STREAMS_OFF = (30, 31, 33, 105, 331, 111, 141, 132, 83, 85, 36, 74, 24, 87)
 """what a companion's link carries by default and nobody here reads"""
 NAV_TAKEOFF, DO_SET_MODE, COMPONENT_ARM_DISARM, SET_MESSAGE_INTERVAL, REQUEST_MESSAGE = 22, 176, 400, 511, 512
@@ -23,6 +22,11 @@ CUSTOM_MODE_ENABLED = 1
 """MAV_MODE_FLAG"""
 FORCE = 21196.0
 """param2 of COMPONENT_ARM_DISARM by which motors stop in flight too"""
+
+
+def streams_hz(position_rate_hz: float) -> dict[int, float]:
+    """Every message whose rate a companion sets; 0: off."""
+    return {POSITION_MESSAGE_ID: position_rate_hz, **STREAMS_HZ, **dict.fromkeys(STREAMS_OFF, 0.0)}
 
 
 class Px4Mode(IntEnum):
@@ -53,8 +57,8 @@ def mode_name(custom_mode: int) -> str:
 
 def parameter_value(raw: bytes, kind: int) -> float | int:
     """Value of a PARAM_VALUE from its four bytes: PX4 puts an INT32 bytewise into the float."""
-    (value,) = struct.unpack("<i" if kind == PARAMETER_INT32 else "<f", raw)
-    return int(value) if kind == PARAMETER_INT32 else float(value)
+    value: float | int = struct.unpack("<i" if kind == PARAMETER_INT32 else "<f", raw)[0]
+    return value
 
 
 def arm_parameters(arm: bool) -> tuple[int, float]:

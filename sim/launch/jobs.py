@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from companion.config import FleetConfig
-from companion.config.file import load
+from companion.config.file import parse_text, read_text
 from companion.io.process import fly_vehicle
 from sim.autopilot.stub_fleet import check_stub_links, stub_settings
 from sim.autopilot.stubs import run_stubs
@@ -29,10 +29,9 @@ class FleetFiles:
 
     def read(self, path: Path) -> tuple[str, FleetConfig]:
         """Text and configuration; ConfigError as `load`."""
-        text = path.read_text(encoding="utf-8") if path.exists() else None
+        text = read_text(path)
         if path not in self._read or self._read[path][0] != text:
-            config = load(path)
-            self._read[path] = path.read_text(encoding="utf-8"), config
+            self._read[path] = text, parse_text(text, path)
         return self._read[path]
 
 

@@ -9,7 +9,6 @@ import os
 import select
 import signal
 import socket
-import struct
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -27,6 +26,7 @@ from companion.core.frames import Geodetic, Ned, geodetic_to_ned, ned_to_geodeti
 from companion.errors import CompanionError
 from companion.io.link import SO_TIMESTAMPNS, received_unix_ns
 from companion.vehicle.autopilot.px4_versions import same_setting
+from companion.wire.mavlink_frames import HEAD_2
 from companion.wire.px4 import interval_parameters, parameter_value
 from sim.autopilot.stubs import TRUTH_DTYPE
 from sim.launch.ended import tell_ended
@@ -224,9 +224,7 @@ class SitlHost:
                 case mavlink.MAVLink_extended_sys_state_message():
                     instance.landed_state = message.landed_state
                 case mavlink.MAVLink_param_value_message():
-                    instance.checked[message.param_id.rstrip("\x00")] = parameter_value(
-                        struct.pack("<f", message.param_value), message.param_type
-                    )
+                    instance.checked[message.param_id.rstrip("\x00")] = told_value(message)
 
     def _read_truth(self, instance: _Instance) -> None:
         rows = []
@@ -279,6 +277,11 @@ class SitlHost:
 
     def _ask(self, instance: _Instance, message: Any) -> None:
         self._gcs.sendto(message.pack(self._mav), ("127.0.0.1", GCS_PORT_OF_INSTANCE + instance.index))
+
+
+def told_value(message: Any) -> float | int:
+    """Value of a PARAM_VALUE by its frame's bytes: as a float, an integer that is a signalling NaN's loses a bit."""
+    return parameter_value(bytes(message.get_msgbuf()[HEAD_2 : HEAD_2 + 4]), message.param_type)
 
 
 def _missing(instance: _Instance) -> dict[str, float | int | None]:

@@ -20,6 +20,7 @@ from companion.core.failsafe import Failsafe
 from companion.core.frames import Ned
 from companion.core.values import Instant, Phase
 from companion.errors import CompanionError
+from companion.io.records import peer_body
 from companion.vehicle.agent import Agent
 from companion.vehicle.outputs import Outputs
 from companion.wire.events import encode_event
@@ -243,7 +244,7 @@ class Lockstep:
         for datagram in out.mavlink:
             self._log(i, "output/mavlink", datagram)
         for topic, payload in out.peers:
-            self._log(i, "output/peer", f"{topic}\0".encode() + payload)
+            self._log(i, "output/peer", peer_body(topic, payload))
             self.sent.append(Sent(self.now_ns, i, topic, len(payload)))
         for event in out.events:
             self._log(i, "event", encode_event(event))
@@ -289,7 +290,7 @@ class Lockstep:
             if key.split("/")[-2] == str(j):
                 self.own_id_heard[j] += 1
             if agent is v.agent:
-                self._log(j, "input/peer", key.encode() + b"\0" + payload)
+                self._log(j, "input/peer", peer_body(key, payload))
             agent.receive_peer(key, payload, self.now)
 
     # -- what a test or a study does with it -------------------------------------------------------------------------

@@ -19,7 +19,7 @@ from companion.core.failsafe import Failsafe
 from companion.core.safety.filter import COLLISION_DISTANCE_M as COLLISION_M
 from companion.core.values import FLYING_PHASES, Instant, Phase
 from companion.errors import ConfigError
-from companion.vehicle.autopilot.px4 import ON_GROUND
+from companion.wire.mavlink import ON_GROUND
 from companion.wire.px4 import Px4Mode
 from sim.autopilot.faults import Fault, FaultKind
 from sim.lockstep.lockstep import Lockstep, Vehicle

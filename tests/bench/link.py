@@ -60,7 +60,7 @@ def companion(port: int, meter: Meter, quiet: bool) -> None:
     from companion.wire.mavlink import LocalPosition, MavlinkCodec
 
     link, codec = UdpLink("127.0.0.1", port), MavlinkCodec(1)
-    streams = {**px4.STREAMS_HZ, **dict.fromkeys(px4.STREAMS_OFF, 0.0)} if quiet else {px4.POSITION_MESSAGE_ID: 50.0}
+    streams = px4.streams_hz(50.0) if quiet else {px4.POSITION_MESSAGE_ID: 50.0}
     asked, next_s = list(streams.items()), 0.0
     while not meter.over:
         ready, _, _ = select.select([link], [], [], 0.5)

@@ -10,7 +10,7 @@ from flights import distances, fleet, launch, set_parameter, truth, until, until
 from companion.core.frames import Ned
 from companion.core.values import ZERO, PeerMessage, PeerSample, Phase
 from companion.core.vectors import lerp
-from companion.vehicle.autopilot.px4 import ON_GROUND
+from companion.wire.mavlink import ON_GROUND
 from companion.wire.peer import encode_state
 from sim.lockstep.lockstep import Lockstep
 

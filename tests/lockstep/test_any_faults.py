@@ -13,7 +13,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from companion.core.failsafe import Failsafe
 from companion.core.safety.filter import COLLISION_DISTANCE_M
 from companion.core.values import FLYING_PHASES, Instant, Phase
-from companion.vehicle.autopilot.px4 import ON_GROUND
+from companion.wire.mavlink import ON_GROUND
 from companion.wire.px4 import Px4Mode
 from sim.autopilot.faults import Fault, FaultKind
 from sim.lockstep.lockstep import UTC_AT_START_NS, Lockstep

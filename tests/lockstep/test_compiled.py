@@ -35,8 +35,3 @@ def test_every_module_that_is_to_be_compiled_is_there() -> None:
 def test_a_compiled_copy_is_made_in_a_new_folder_alone(tmp_path: Path) -> None:
     with pytest.raises(CompanionError, match="exists already; name a new folder"):
         build(tmp_path)
-
-
-def test_what_is_compiled_is_there() -> None:
-    assert [module for module in MODULES if not (ROOT / module).is_file()] == []
-    assert len(set(MODULES)) == len(MODULES)

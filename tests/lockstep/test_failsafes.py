@@ -25,7 +25,8 @@ from pymavlink.dialects.v20 import development as dialect
 from companion.core.failsafe import FAILSAFES, LATE_S, STATUS_S, UNCERTAIN_S, Action, Failsafe
 from companion.core.frames import Ned
 from companion.core.values import Instant, PeerMessage, Phase
-from companion.vehicle.autopilot.px4 import ON_GROUND, Px4Autopilot
+from companion.vehicle.autopilot.px4 import Px4Autopilot
+from companion.wire.mavlink import ON_GROUND
 from companion.wire.peer import encode_state
 from companion.wire.px4 import Px4Mode, mode_parameters
 from sim.autopilot.faults import Fault, FaultKind

@@ -27,7 +27,6 @@ from companion.io.zenoh.configuration import (
     REQUESTS_HZ,
     STATE_MAX_BYTES,
     SessionSettings,
-    mesh_endpoints,
     scouting_port,
     zenoh_configuration,
 )
@@ -39,6 +38,11 @@ PATIENCE_S = 10.0
 """how long a test waits for what must come; far above what it takes"""
 
 _numbers = itertools.count()
+
+
+def mesh_endpoints(host: str, port: int = 7447) -> tuple[str, str]:
+    """The pair of endpoints of one vehicle in the field: reliable traffic over TCP, best effort over UDP."""
+    return f"tcp/{host}:{port}?rel=1", f"udp/{host}:{port}?rel=0"
 
 
 @pytest.fixture
@@ -256,7 +260,7 @@ def test_what_a_vehicle_publishes_reaches_its_peers_and_not_itself(fleet: str) -
         assert one.presence() == [(2, True)]
         assert all(e.received_monotonic_ns > sent_ns for e in two.events if isinstance(e, ReceivedSample))
         counters = one.network.counters
-        assert (counters.dropped, counters.malformed, counters.own_id_heard, counters.publish_failures) == (0, 0, 0, 0)
+        assert (counters.dropped, counters.malformed, counters.publish_failures) == (0, 0, 0)
 
 
 @pytest.mark.process
@@ -318,7 +322,9 @@ def test_endpoints_given_on_a_laptop_connect_without_scouting_and_in_any_order_o
     one, two = Vehicle(settings[0]), Vehicle(settings[1])
     with one.network, two.network:
         one.wait_presence(2, True)
-        assert one.network.connected_peers == 1
+        two.wait_presence(1, True)
+        one.network.publish("state", b"said")
+        two.wait_message("fleet/1/state", b"said")
 
 
 @pytest.mark.process
@@ -360,7 +366,7 @@ def test_foreign_keys_deletions_and_oversized_payloads_are_counted_and_not_deliv
 
 
 @pytest.mark.process
-def test_somebody_else_speaking_under_our_id_is_counted_and_told_to_the_agent(fleet: str) -> None:
+def test_somebody_else_speaking_under_our_id_is_told_to_the_agent(fleet: str) -> None:
     with vehicle(fleet, 1) as one, vehicle(fleet, 1) as double, vehicle(fleet, 2) as two:
         two.wait_presence(1, True)
         one.wait_presence(2, True)
@@ -369,7 +375,6 @@ def test_somebody_else_speaking_under_our_id_is_counted_and_told_to_the_agent(fl
         two.network.publish("state", b"true")
         one.wait_message("fleet/2/state", b"true")
         one.wait_message("fleet/1/state", b"false")
-        assert eventually(lambda: one.network.counters.own_id_heard == 1)
         assert sorted(one.messages()) == [("fleet/1/state", b"false"), ("fleet/2/state", b"true")]
 
 

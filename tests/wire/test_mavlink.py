@@ -47,11 +47,11 @@ HEARD: list[tuple[Any, wire.Event]] = [
     (local_position(*POSITION), wire.LocalPosition(1000, Ned(1.0, -2.0, -10.0), Ned(0.5, 0.25, -0.125))),
     (
         dialect.MAVLink_heartbeat_message(2, 12, 128 | 1, int(Px4Mode.OFFBOARD), 4, 3),
-        wire.Heartbeat(12, 2, True, int(Px4Mode.OFFBOARD), 4),
+        wire.Heartbeat(12, 2, True, int(Px4Mode.OFFBOARD)),
     ),
     (
         dialect.MAVLink_heartbeat_message(2, 3, 81, 4, 3, 3),
-        wire.Heartbeat(3, 2, False, 4, 3),
+        wire.Heartbeat(3, 2, False, 4),
     ),
     (dialect.MAVLink_current_mode_message(0, int(Px4Mode.AUTO_LAND), 0), wire.CurrentMode(int(Px4Mode.AUTO_LAND), 0)),
     (dialect.MAVLink_extended_sys_state_message(0, 2), wire.LandedState(2)),
@@ -61,11 +61,11 @@ HEARD: list[tuple[Any, wire.Event]] = [
     ),
     (
         dialect.MAVLink_estimator_status_message(0, 0x33F, 0, 0, 0, 0, 0, 0, 0.5, 0.25),
-        wire.EstimatorHealth(0x33F, 0.5, 0.25),
+        wire.EstimatorHealth(0x33F, 0.5),
     ),
     (
         dialect.MAVLink_estimator_status_message(0, 1, 0, 0, 0, 0, 0, 0, nan, inf),
-        wire.EstimatorHealth(1, inf, inf),
+        wire.EstimatorHealth(1, inf),
     ),
     (dialect.MAVLink_sys_status_message(0, 0, 5, 0, 0, 0, 80, 0, 0, 0, 0, 0, 0), wire.SystemHealth(5, 80)),
     (dialect.MAVLink_command_ack_message(176, 0, 0, 0, SYSTEM_ID, 191), wire.CommandAnswer(176, 0)),
@@ -333,16 +333,15 @@ def as_pymavlink_reads(message: Any) -> list[wire.Event]:
             return [wire.LandedState(message.landed_state)]
         case "HEARTBEAT":
             armed = bool(message.base_mode & 128)
-            status = message.system_status
-            told_of = wire.Heartbeat(message.autopilot, message.type, armed, message.custom_mode, status)
+            told_of = wire.Heartbeat(message.autopilot, message.type, armed, message.custom_mode)
             return [told_of] if message.autopilot != dialect.MAV_AUTOPILOT_INVALID else []
         case "GPS_GLOBAL_ORIGIN":
             north, east = message.latitude, message.longitude
             some = (north, east) != (0, 0) and abs(north) <= 900_000_000 and abs(east) <= 1_800_000_000
             return [wire.GlobalOrigin(Geodetic(north * 1e-7, east * 1e-7, message.altitude * 1e-3))] if some else []
         case "ESTIMATOR_STATUS":
-            both = (message.pos_horiz_accuracy, message.pos_vert_accuracy)
-            return [wire.EstimatorHealth(message.flags, *(x if 0.0 < x < inf else inf for x in both))]
+            accuracy = message.pos_horiz_accuracy
+            return [wire.EstimatorHealth(message.flags, accuracy if 0.0 < accuracy < inf else inf)]
         case "SYS_STATUS":
             charge = message.battery_remaining
             return [wire.SystemHealth(message.onboard_control_sensors_health, charge if 0 <= charge <= 100 else -1)]

@@ -99,11 +99,6 @@ def scouting_port(fleet_name: str) -> int:
     return _SCOUTING_PORTS[zlib.crc32(fleet_name.encode()) % len(_SCOUTING_PORTS)]
 
 
-def mesh_endpoints(host: str, port: int = 7447) -> tuple[str, str]:
-    """The pair of endpoints of one vehicle in the field: reliable traffic over TCP, best effort over UDP."""
-    return f"tcp/{host}:{port}?rel=1", f"udp/{host}:{port}?rel=0"
-
-
 def zenoh_configuration(settings: SessionSettings) -> zenoh.Config:
     """Zenoh's configuration for these settings."""
     match settings.profile:

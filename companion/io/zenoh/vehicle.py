@@ -142,11 +142,6 @@ class ZenohTransport:
         """Over all TCP connections of this process: nothing else in it opens any."""
         return tcp_bytes_sent()
 
-    @property
-    def connected_peers(self) -> int:
-        """Sessions this one is connected to, operators included."""
-        return 0 if self._session is None or self._closed else len(self._session.info.peers_zid())
-
     def close(self) -> None:
         """Leave the fleet: the others see this vehicle vanish. May be called again."""
         self._closed = True

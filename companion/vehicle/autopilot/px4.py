@@ -38,8 +38,6 @@ from companion.wire.mavlink import MavlinkCodec
 from companion.wire.px4 import Px4Mode, mode_name
 
 CLOCK_SAMPLES = 5
-ON_GROUND = 1
-"""EXTENDED_SYS_STATE's landed state; 0 is unknown"""
 FLAGS_NEEDED = 1 | 2 | 4
 """ESTIMATOR_STATUS: attitude, horizontal and vertical velocity"""
 GLOBAL_FLAG, RELATIVE_FLAG = 16, 8
@@ -93,7 +91,7 @@ class Px4Autopilot:
         self.battery_percent = -1
         self.sensors_health = 0
         self.home_altitude_amsl_m: float | None = None
-        self.estimator = wire.EstimatorHealth(0, inf, inf)
+        self.estimator = wire.EstimatorHealth(0, inf)
         self.estimator_ns: int | None = None
         """when ESTIMATOR_STATUS last came (monotonic ns)"""
         self.health_ns: int | None = None
@@ -170,9 +168,7 @@ class Px4Autopilot:
 
     def _set_up(self) -> None:
         """Ask for what we read, and for no more: a companion's link may be a serial line."""
-        streams = {**px4.STREAMS_HZ, px4.POSITION_MESSAGE_ID: self.config.limits.control_rate_hz}
-        streams |= dict.fromkeys(px4.STREAMS_OFF, 0.0)
-        for message_id, rate_hz in streams.items():
+        for message_id, rate_hz in px4.streams_hz(self.config.limits.control_rate_hz).items():
             self.requests.ask(f"{STREAM} {message_id}", *px4.interval_parameters(message_id, rate_hz))
 
     def _position(self, message: wire.LocalPosition, now: Instant) -> bool:
@@ -329,7 +325,7 @@ class Px4Autopilot:
     @property
     def on_ground(self) -> bool | None:
         """Whether it stands on the ground; None while it does not tell."""
-        return None if self.landed_state == 0 else self.landed_state == ON_GROUND
+        return None if self.landed_state == 0 else self.landed_state == wire.ON_GROUND
 
     @property
     def rejected(self) -> Counter[str]:

@@ -11,6 +11,8 @@ from companion.vehicle.flight import Flight
 
 STOPPED_LOW_S = FROZEN_S + 0.1
 """a climb that ended too low by positions that may have frozen meanwhile, which shows after FROZEN_S"""
+ON_THE_WAY_UP = (TAKE_OFF, HOLD, OFFBOARD)
+"""modes of a take-off, from arming until setpoints are followed"""
 
 
 class HeartbeatLost(Detector):
@@ -59,17 +61,16 @@ class LeftByAutopilot(_ModeLeft):
 def mode_is_foreign(flight: Flight) -> bool:
     """Whether the mode is one in which nobody may be who flies for us."""
     mode, before = flight.autopilot.mode, flight.mode_before
-    ours = mode in (TAKE_OFF, HOLD, OFFBOARD)
     match flight.phase:
         case Phase.ARMED:
-            return not ours and mode != before
+            return mode not in (*ON_THE_WAY_UP, before)
         case Phase.CLIMBING:
-            return not ours
+            return mode not in ON_THE_WAY_UP
         case Phase.LANDING if flight.land_seen:
             # On disarming PX4 falls back to the mode before, which the heartbeat tells a second later.
             return mode not in (LAND, OFFBOARD, before) and not flight.autopilot.on_ground
         case Phase.LANDING:
-            return not ours and mode not in (LAND, before)
+            return mode not in (*ON_THE_WAY_UP, LAND, before)
     return mode != OFFBOARD
 
 

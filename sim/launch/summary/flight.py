@@ -16,7 +16,7 @@ from companion.core.trajectory.fleet import FleetTrajectory
 from companion.core.trajectory.history import TrajectoryHistory
 from companion.errors import WireError
 from companion.io.recorder import Entry, RecordingError, read_recording
-from companion.io.records import TickRecord, TrafficRecord
+from companion.io.records import TickRecord, TrafficRecord, split_peer_body
 from companion.wire import operator as protocol
 from companion.wire.events import decode_event
 from companion.wire.peer import encode_motion
@@ -131,8 +131,8 @@ class Flight:
                 case "event":
                     self.events.append((now, vehicle_id, decode_event(entry.body)))
                 case "output/peer":
-                    topic, _, payload = entry.body.partition(b"\0")
-                    self.puts.append(Put(now, vehicle_id, topic.decode(), len(payload)))
+                    topic, payload = split_peer_body(entry.body)
+                    self.puts.append(Put(now, vehicle_id, topic, len(payload)))
                 case "input/command":
                     return self._command(now, vehicle_id, entry.body)
                 case "output/answer" if asked is not None:

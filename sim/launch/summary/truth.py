@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from companion.wire.mavlink import ON_GROUND
 from sim.launch.summary.flight import Array
 from sim.launch.summary.numbers import rms, rounded
 
-ON_GROUND = 1
 ALOFT_M = 0.3
 """a vehicle so far above the lowest place where it was is in the air, whatever its land detector says: PX4 takes what
 is disarmed for landed"""
