@@ -11,6 +11,7 @@ import typer
 
 from companion.errors import CompanionError, RefusedError
 from companion.operator import verbs
+from companion.terminal import tell, tolerate_any_encoding
 
 app = typer.Typer(
     no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, help="One vehicle's companion process."
@@ -71,13 +72,13 @@ def check(
         rows.append(row)
         if not as_json:
             value = "-" if row.value is None else row.value
-            typer.echo(f"{'ok' if row.passed else 'FAULT':5}  {row.name:20}  {value!s:>20}  {row.limit}")
+            tell(f"{'ok' if row.passed else 'FAULT':5}  {row.name:20}  {value!s:>20}  {row.limit}")
     faults = unmet(rows)
     if as_json:
         typer.echo(json.dumps({"fit": not faults, "checks": [asdict(r) for r in rows]}))
     else:
         for fault in faults:
-            typer.echo(fault.message)
+            tell(fault.message)
     raise typer.Exit(DIFFERENT if faults else 0)
 
 
@@ -94,18 +95,19 @@ def replay(
     began_s = process_time()
     result = replay_file(file)
     spent_s = process_time() - began_s
-    typer.echo(result.sentence())
+    tell(result.sentence())
     if result.same and result.ticks:
-        typer.echo(f"{1e3 * spent_s / result.ticks:.2f} ms of CPU a control tick, reading and decoding included")
+        tell(f"{1e3 * spent_s / result.ticks:.2f} ms of CPU a control tick, reading and decoding included")
     raise typer.Exit(0 if result.same else DIFFERENT)
 
 
 def main() -> None:
     """Entry point: errors that a user can act on end with a sentence, not a traceback."""
+    tolerate_any_encoding()
     try:
         app(standalone_mode=True)
     except CompanionError as error:
-        typer.echo(f"companion: {error}", err=True)
+        tell(f"companion: {error}", error=True)
         raise SystemExit(REFUSED if isinstance(error, RefusedError) else USAGE_ERROR) from None
 
 

@@ -13,6 +13,7 @@ import typer
 from companion.errors import CompanionError, ConfigError
 from companion.operator import verbs
 from companion.operator.verbs import FAILED, FLEET_TOML, FleetFile, Vehicles
+from companion.terminal import tell, tolerate_any_encoding
 from sim.autopilot.faults import Fault, FaultKind
 
 app = typer.Typer(
@@ -112,7 +113,7 @@ def up(
             allow_missing,
         )  # fmt: skip
         with FlightView(quiet=as_json) as view:
-            summary = fly(tables, options, view.show, interrupted, lambda line: typer.echo(line, err=True))
+            summary = fly(tables, options, view.show, interrupted, lambda line: tell(line, error=True))
     if as_json:
         typer.echo(json.dumps(summary))
     else:
@@ -153,7 +154,7 @@ def stub(
     check_stub_links(config)
     if not launched:
         for v in config.vehicles:
-            typer.echo(f"vehicle {v.id}: system id {v.system_id}, speaks to {v.mavlink}", err=True)
+            tell(f"vehicle {v.id}: system id {v.system_id}, speaks to {v.mavlink}", error=True)
     run_stubs(
         stub_settings(
             config, seed=seed, truth_path=truth, stop_fd=sys.stdin.fileno() if launched else None,
@@ -181,7 +182,7 @@ def fault(
         raise ConfigError(f"fault must be one of {', '.join(FaultKind)}, got {kind!r}")
     config = fleet_config(fleet, vehicles)
     order_fault(config, vehicle, Fault(FaultKind(kind), magnitude, float("inf") if duration is None else duration))
-    typer.echo(f"vehicle {vehicle}: {kind}")
+    tell(f"vehicle {vehicle}: {kind}")
 
 
 @app.command(hidden=True)
@@ -251,7 +252,7 @@ def law_check(
 
     passed = True
     for row in check(name, {} if fleet is None else read_tables(fleet).get("law", {})):
-        typer.echo(f"{'ok' if row.passed else 'FAULT':5}  {row.name:40}  {row.value:>14}  {row.limit}")
+        tell(f"{'ok' if row.passed else 'FAULT':5}  {row.name:40}  {row.value:>14}  {row.limit}")
         passed = passed and row.passed
     raise typer.Exit(0 if passed else FAILED)
 
@@ -261,18 +262,19 @@ verbs.mount(app)
 
 def main() -> None:
     """Entry point: errors that a user can act on end with a sentence, not a traceback."""
+    tolerate_any_encoding()
     try:
         app(standalone_mode=True)
     except CompanionError as error:
-        typer.echo(f"fleet: {error}", err=True)
+        tell(f"fleet: {error}", error=True)
         raise SystemExit(USAGE_ERROR if isinstance(error, ConfigError) else FAILED) from None
     except ModuleNotFoundError as error:
         if error.name is None or error.name.split(".")[0] in ("companion", "sim"):
             raise
-        typer.echo(
+        tell(
             f"fleet: this command needs {error.name}, which is not installed: pip install 'starling-fleet[sim]'. "
             "The operator's verbs (status, land, kill, ...) need no extra",
-            err=True,
+            error=True,
         )
         raise SystemExit(USAGE_ERROR) from None
 

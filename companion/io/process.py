@@ -12,6 +12,7 @@ from pathlib import Path
 
 from companion.config import FleetConfig
 from companion.io.loop import Companion, RunSettings
+from companion.terminal import one_line
 
 SWITCH_INTERVAL_S = 0.0005
 """how long the recorder or a network callback may keep the interpreter from the loop"""
@@ -27,7 +28,7 @@ def fly_vehicle(
 
     def log(line: str) -> None:
         # Not through a buffer, which on a full disk would fail again at the end and change the exit status.
-        os.write(1, f"vehicle {vehicle_id}: {line}\n".encode())
+        os.write(1, log_line(vehicle_id, line))
 
     settings = RunSettings(vehicle_id, record, stop_fd, log, file)
     companion = Companion(config, settings, {"config": text, "version": product_version()})
@@ -35,6 +36,11 @@ def fly_vehicle(
         return run_in_process(companion)
     finally:
         companion.close()
+
+
+def log_line(vehicle_id: int, note: str) -> bytes:
+    """A note as the log has it."""
+    return f"vehicle {vehicle_id}: {one_line(note)}\n".encode()
 
 
 @cache

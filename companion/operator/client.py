@@ -28,6 +28,7 @@ from companion.operator.clocks import clock_offsets
 from companion.operator.newest import newest_motion
 from companion.operator.preflight import FleetReport, fleet_report
 from companion.operator.roster import RETRY_S, STATUS_TIMEOUT_S, Link, Roster
+from companion.terminal import one_line
 from companion.wire.operator import ENDING, Answer, Command, PreflightReport, Status, Verb, decode, encode
 from companion.wire.peer import motion_to_json
 
@@ -140,7 +141,7 @@ class Operator:
                 notes += [f"vehicle {i}'s answer cannot be read: {a}" for a in answers[:1] if isinstance(a, str)]
                 continue
             self.roster.note_places(i, [a.place for a in read])
-            reasons = [str(a.reason)[:REASON_LENGTH_MAX] for a in read if not a.accepted]
+            reasons = [one_line(str(a.reason), REASON_LENGTH_MAX) for a in read if not a.accepted]
             if not reasons:
                 accepted.append(i)
                 continue

@@ -5,7 +5,7 @@ A vehicle on its own cannot know that another's file, clock, altitude or place d
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import combinations
 from math import inf
 from statistics import median
@@ -74,8 +74,8 @@ def fleet_report(
     for i, why in unreadable.items():
         says = f"its answer cannot be read ({why}): is its companion of another version?"
         rows.append(Check("answer", None, "of this version's form", False, says, True, i))
-    for report in heard.values():
-        rows += report.checks
+    for i, report in heard.items():
+        rows += [replace(c, vehicle=i) for c in report.checks]
     rows += _identities(config, heard, boots)
     rows += _agreement(config, heard)
     rows += _clocks(config, heard, offsets)

@@ -5,6 +5,7 @@ from typing import Protocol
 
 from companion.config import FleetConfig
 from companion.errors import RefusedError, WireError
+from companion.terminal import one_line
 from companion.wire.operator import ENDING, PLACES_MAX, Place, Status, decode
 
 STATUS_TIMEOUT_S = 1.0
@@ -113,7 +114,7 @@ class Roster:
         """Which flight the last statuses were of."""
         if not self._seen:
             return f"fleet {self._fleet_name}: nobody"
-        names = sorted({s.fleet for s in self._seen.values()})
+        names = sorted({one_line(s.fleet) for s in self._seen.values()})
         shortest, longest = (f(s.up_s for s in self._seen.values()) for f in (min, max))
         since = f"{longest:.0f} s" if longest - shortest < UP_TOGETHER_S else f"{shortest:.0f} to {longest:.0f} s"
         return f"fleet {' and '.join(names)}, companions up for {since}"

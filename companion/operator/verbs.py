@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from companion.errors import ConfigError, RefusedError
+from companion.terminal import tell
 
 if TYPE_CHECKING:
     from companion.operator.client import Answers, Operator
@@ -47,7 +48,7 @@ def init(
     from companion.shipped import write_shipped
 
     for path in write_shipped(folder):
-        typer.echo(f"written: {path}")
+        tell(f"written: {path}")
 
 
 @contextmanager
@@ -70,7 +71,7 @@ def command(
     """Command the fleet, tell what it said, and end."""
     with connected(fleet, vehicles, both=both) as operator:
         answers = act(operator)
-    typer.echo(f"{answers.sentence(verb)} ({operator.roster.reached})")
+    tell(f"{answers.sentence(verb)} ({operator.roster.reached})")
     raise typer.Exit(0 if answers.all_accepted else FAILED)
 
 
@@ -93,10 +94,10 @@ def status(
     else:
         from companion.operator.views import show_status
 
-        typer.echo(roster.reached)
+        tell(roster.reached)
         show_status(statuses)
     for sentence in (*roster.left_out, *roster.two_companions):
-        typer.echo(sentence, err=True)
+        tell(sentence, error=True)
     raise typer.Exit(0 if all(s is not None for s in statuses.values()) else FAILED)
 
 

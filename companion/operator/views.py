@@ -11,10 +11,13 @@ from rich.table import Table
 from rich.text import Text
 
 from companion.operator.preflight import FleetReport
+from companion.terminal import one_line, printable
 from companion.wire.operator import Check, Status
 
 REMARKS_LEAST = 24
 """columns without which the remarks stand below the table only"""
+REMARKS_MAX = 4000
+"""characters of one vehicle's remarks"""
 GAP = 2
 Vehicles = Mapping[int, Status | None]
 PHASE_STYLES = {
@@ -83,7 +86,7 @@ def status_table(
             text = c.cell(s, None if rates is None else rates.get(i)) if s is not None else ""
             style = PHASE_STYLES.get(phase_of(s), "") if c.rank == 0 else ""
             cells.append(Text(phase_of(s) if s is None and c.rank == 0 else text, style=style))
-        remarks = Text("; ".join(_remarks(s)) if s is not None else "", style="yellow")
+        remarks = Text(_remarks(s) if s is not None else "", style="yellow")
         if room >= REMARKS_LEAST:
             cells.append(remarks)
         table.add_row(*cells)
@@ -100,16 +103,11 @@ def status_table(
     return Group(*lines)
 
 
-def one_line(said: str) -> str:
-    """A text of a vehicle's on one line and without control characters."""
-    return " ".join("".join(c if c.isprintable() else " " for c in said).split())
-
-
-def _remarks(status: Status) -> list[str]:
+def _remarks(status: Status) -> str:
     waiting = status.phase in ("idle", "landed") and not status.armed
     rejected = sum(status.rejected.values())
     said = [*([status.killed] if status.killed else []), *status.failsafes, *(status.ready if waiting else [])]
-    return [*map(one_line, said), *([f"{rejected} rejected"] if rejected else [])]
+    return one_line("; ".join([*said, *([f"{rejected} rejected"] if rejected else [])]), REMARKS_MAX)
 
 
 def _worst(vehicles: Vehicles, count: int) -> Vehicles:
@@ -156,12 +154,12 @@ def show_preflight(report: FleetReport, explain: bool) -> None:
         table.add_column("")
         for c in report.checks:
             table.add_row(
-                str(c.vehicle) if c.vehicle else "fleet", c.name, _value(c), c.limit,
+                str(c.vehicle) if c.vehicle else "fleet", *(Text(one_line(t)) for t in (c.name, _value(c), c.limit)),
                 Text("met", style="green") if c.passed else Text("NOT MET", style="red"),
             )  # fmt: skip
         console.print(table)
     for fault in report.faults:
-        console.print(fault, style="red", highlight=False, soft_wrap=True, markup=False)
+        console.print(printable(fault), style="red", highlight=False, soft_wrap=True, markup=False)
     fit = f"fit for take-off: {len(report.checks)} checks met"
     console.print(fit if report.fit else f"not fit for take-off: {len(report.faults)} of {len(report.checks)} checks")
 

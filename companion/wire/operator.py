@@ -18,6 +18,7 @@ from typing import Annotated, Any, Final, Literal, NamedTuple, TypeVar, get_args
 from pydantic import Field, TypeAdapter, ValidationError
 
 from companion.errors import WireError
+from companion.terminal import one_line
 
 COMMAND_BYTES_MAX: Final = 65_536
 """what the transport carries"""
@@ -165,12 +166,13 @@ class Check:
     """the fault as a sentence; of no meaning when passed"""
     permanent: bool = False
     """whether it cannot come right by waiting"""
-    vehicle: int = 0
+    vehicle: _SystemId = 0
     """whose; 0: the fleet's"""
 
     def sentence(self) -> str:
         """The fault with the name of whose it is."""
-        return f"vehicle {self.vehicle}: {self.message}" if self.vehicle else self.message
+        message = one_line(self.message)
+        return f"vehicle {self.vehicle}: {message}" if self.vehicle else message
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -245,7 +247,7 @@ def decode(kind: type[_S], payload: bytes) -> _S:
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False, include_input=False)[0]
         place = ".".join(str(p) for p in first["loc"]) or "JSON"
-        raise WireError("answer", f"{place[:80]}: {first['msg'][:160]}") from None
+        raise WireError("answer", one_line(f"{place[:80]}: {first['msg'][:160]}")) from None
     return said
 
 

@@ -40,6 +40,7 @@ from companion.core.trajectory_check import (
 )
 from companion.core.values import PeerMessage, PeerSample, Phase
 from companion.errors import WireError
+from companion.terminal import one_line
 
 VERSION = 3
 """3: near mode's flag and ids"""
@@ -218,7 +219,7 @@ def motion_from_json(plain: object) -> FleetTrajectory:
     try:
         payload = json.dumps(plain).encode()
     except (ValueError, TypeError, RecursionError) as error:
-        raise WireError("motion", str(error)[:160]) from None
+        raise WireError("motion", one_line(str(error), 160)) from None
     return decode_motion(payload)
 
 
@@ -231,7 +232,7 @@ def decode_motion(payload: bytes) -> FleetTrajectory:
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False, include_input=False)[0]
         place = ".".join(str(p) for p in first["loc"])
-        raise WireError("motion", f"{place[:80]}: {first['msg'][:160]}") from None
+        raise WireError("motion", one_line(f"{place[:80]}: {first['msg'][:160]}")) from None
     if 0.0 < m.blend_s < BLEND_MIN_S:
         raise WireError("motion", f"blend_s: must be 0 s or at least {BLEND_MIN_S:g} s, got {m.blend_s:g}")
     legs: list[Leg] = []

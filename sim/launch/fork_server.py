@@ -27,6 +27,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from companion.errors import CompanionError
+from companion.terminal import tell
 from sim.launch.jobs import LIFELINE, FleetFiles, Job, decode
 from sim.launch.linux import show_as, signal_at_parents_death
 
@@ -135,8 +136,7 @@ def main() -> None:
     for name in PRELOADED:
         importlib.import_module(name)
     if len(os.listdir("/proc/self/task")) > 1:
-        sys.stderr.write("something has started a thread, which the forked processes will not have\n")
-        sys.stderr.flush()
+        tell("something has started a thread, which the forked processes will not have", error=True)
     gc.collect()
     gc.freeze()
     files = FleetFiles()
@@ -147,7 +147,7 @@ def main() -> None:
     try:
         status = job.run(files)
     except CompanionError as error:
-        sys.stderr.write(f"{job.program}: {error}\n")
+        tell(f"{job.program}: {error}", error=True)
         status = USAGE_ERROR
     sys.exit(status)
 

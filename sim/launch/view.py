@@ -9,7 +9,8 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from companion.operator.views import Vehicles, one_line, phases, status_table
+from companion.operator.views import Vehicles, phases, status_table
+from companion.terminal import LINE_MAX, one_line, printable
 from sim.launch.processes import how_it_ended
 from sim.launch.watch import Progress
 
@@ -59,17 +60,17 @@ class FlightView:
         fleet = progress.vehicles
         head = f"{progress.elapsed_s:6.1f} s  {progress.doing}: {phases(fleet)}{_nearest(fleet)}"
         ended = [f"companion {i}, {how_it_ended(s)}" for i, s in sorted(progress.ended.items())]
-        ended += [f"vehicle {i}: {how}" for i, how in sorted(progress.autopilots_ended.items())]
+        ended += [f"vehicle {i}: {one_line(how)}" for i, how in sorted(progress.autopilots_ended.items())]
         ended += [f"vehicle {i}: {one_line(s.killed)}" for i, s in sorted(fleet.items()) if s and s.killed]
         lines = [head, *([f"ended: {', '.join(ended)}"] if ended else [])]
         if self._live is not None:
             width, height = self._console.size
             table = status_table(progress.vehicles, self._rates, width=width, height=height - 1 - len(lines))
-            heads = [Text(line, no_wrap=True, overflow="ellipsis") for line in lines]
+            heads = [Text(printable(line), no_wrap=True, overflow="ellipsis") for line in lines]
             self._live.update(Group(*heads, table), refresh=True)
         elif progress.elapsed_s - self._told_s >= PLAIN_INTERVAL_S or (progress.doing, ended) != self._news:
             self._told_s, self._news = progress.elapsed_s, (progress.doing, ended)
-            self._console.print("; ".join(lines), highlight=False, soft_wrap=True, markup=False)
+            self._console.print(printable("; ".join(lines)), highlight=False, soft_wrap=True, markup=False)
 
 
 def show_summary(summary: Mapping[str, Any]) -> None:
@@ -108,12 +109,13 @@ def show_summary(summary: Mapping[str, Any]) -> None:
         ("folder", summary.get("folder", "-")),
     ]
     for name, value in rows:
-        table.add_row(name, Text(str(value)))
+        table.add_row(name, Text(one_line(str(value), LINE_MAX)))
     console = Console()
     console.print(table)
     for c in summary["criteria"]:
         if not c["met"]:
-            console.print(f"not met: {c['what']} {c['limit']}, got {c['value']}", style="red", highlight=False)
+            said = one_line(f"not met: {c['what']} {c['limit']}, got {c['value']}")
+            console.print(said, style="red", highlight=False, markup=False)
     console.print("passed" if summary["passed"] else "not passed", style="green" if summary["passed"] else "red")
 
 
