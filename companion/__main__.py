@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from companion.errors import CompanionError, RefusedError
+from companion.errors import CompanionError
 from companion.operator import verbs
 from companion.terminal import tell, tolerate_any_encoding
 
@@ -19,11 +19,8 @@ app = typer.Typer(
 operator_app = typer.Typer(no_args_is_help=True, help="Command and ask a running fleet, without the simulator.")
 verbs.mount(operator_app)
 app.add_typer(operator_app, name="operator")
-USAGE_ERROR = 2
 DIFFERENT = 1
 """a replay that differs, a check that is not met"""
-REFUSED = 1
-"""an operator's verb that nobody was commanded"""
 
 
 @app.command()
@@ -37,8 +34,9 @@ def run(
 ) -> None:
     """Fly one vehicle: read its autopilot, hear and tell its peers, send setpoints. Ctrl-C lands it and ends.
 
-    Exit status: 0 ended with the vehicle landed or landing, 2 wrong usage or configuration, 3 ended while the autopilot
-    had not confirmed landing, 4 could do nothing any more (a fault of ours; the autopilot's failsafe has the vehicle).
+    Exit status: 0 ended with the vehicle landed or landing, 1 its line, network or recording could not be opened,
+    2 wrong usage or configuration, 3 ended while the autopilot had not confirmed landing, 4 could do nothing any more
+    (a fault of ours; the autopilot's failsafe has the vehicle).
     """
     from companion.config.file import parse_text, read_text
     from companion.io.process import fly_vehicle
@@ -108,7 +106,7 @@ def main() -> None:
         app(standalone_mode=True)
     except CompanionError as error:
         tell(f"companion: {error}", error=True)
-        raise SystemExit(REFUSED if isinstance(error, RefusedError) else USAGE_ERROR) from None
+        raise SystemExit(error.exit_status) from None
 
 
 if __name__ == "__main__":

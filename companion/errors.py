@@ -1,12 +1,19 @@
 """Errors that a user can act on. Misbehaviour of peers and autopilots is counted, not raised."""
 
+from typing import ClassVar
+
 
 class CompanionError(Exception):
     """Base of every error that ends a command with a sentence instead of a traceback."""
 
+    exit_status: ClassVar[int] = 1
+    """of the command that it ends"""
+
 
 class ConfigError(CompanionError):
     """A value in fleet.toml or on the command line is refused; says where, what came and what is allowed."""
+
+    exit_status = 2
 
 
 class WireError(CompanionError):

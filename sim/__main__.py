@@ -267,7 +267,7 @@ def main() -> None:
         app(standalone_mode=True)
     except CompanionError as error:
         tell(f"fleet: {error}", error=True)
-        raise SystemExit(USAGE_ERROR if isinstance(error, ConfigError) else FAILED) from None
+        raise SystemExit(error.exit_status) from None
     except ModuleNotFoundError as error:
         if error.name is None or error.name.split(".")[0] in ("companion", "sim"):
             raise

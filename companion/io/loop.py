@@ -318,6 +318,8 @@ class Companion:
             "mavlink: another address than the autopilot's": self.link.foreign_datagrams,
             "mavlink: could not be sent": self.link.send_failures,
             "peer: malformed": counters.malformed,
+            "peer: could not be sent": counters.publish_failures,
+            "operator: could not be answered": counters.reply_failures,
         }
         rejected = {kind: count for kind, count in elsewhere.items() if count}
         rejected |= {f"raised: {kind}": count for kind, count in self.guard.raised.items()}

@@ -82,6 +82,8 @@ class _Pending(NamedTuple):
 class RecordingError(CompanionError):
     """A file that is no recording, or a damaged one: says which, where in it, and why."""
 
+    exit_status = 2
+
     def __init__(self, path: Path | str, why: str, offset: int | None = None) -> None:
         super().__init__(f"{path}: {why}" if offset is None else f"{path}: at byte {offset}: {why}")
 

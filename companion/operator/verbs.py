@@ -2,7 +2,8 @@
 where the flight part alone is installed.
 
 A verb asks every vehicle, prints one line of what they said, and ends with 0 if all took it, 1 if one refused or is
-silent, 2 for wrong usage or configuration. Whatever costs time is imported inside of a verb: help is read often.
+silent, or where the network cannot be opened, 2 for wrong usage or configuration. Whatever costs time is imported
+inside of a verb: help is read often.
 """
 
 import json

@@ -159,7 +159,7 @@ def show_preflight(report: FleetReport, explain: bool) -> None:
             )  # fmt: skip
         console.print(table)
     for fault in report.faults:
-        console.print(printable(fault), style="red", highlight=False, soft_wrap=True, markup=False)
+        console.print(Text(printable(fault), style="red"), soft_wrap=True)
     fit = f"fit for take-off: {len(report.checks)} checks met"
     console.print(fit if report.fit else f"not fit for take-off: {len(report.faults)} of {len(report.checks)} checks")
 

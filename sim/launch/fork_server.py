@@ -32,7 +32,6 @@ from sim.launch.jobs import LIFELINE, FleetFiles, Job, decode
 from sim.launch.linux import show_as, signal_at_parents_death
 
 END_WITHIN_S = 1.6
-USAGE_ERROR = 2
 ABANDONED = 70
 """exit status of a process that did not finish by itself"""
 PRELOADED = ("companion.io.zenoh.vehicle",)
@@ -148,7 +147,7 @@ def main() -> None:
         status = job.run(files)
     except CompanionError as error:
         tell(f"{job.program}: {error}", error=True)
-        status = USAGE_ERROR
+        status = error.exit_status
     sys.exit(status)
 
 

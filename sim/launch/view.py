@@ -70,7 +70,7 @@ class FlightView:
             self._live.update(Group(*heads, table), refresh=True)
         elif progress.elapsed_s - self._told_s >= PLAIN_INTERVAL_S or (progress.doing, ended) != self._news:
             self._told_s, self._news = progress.elapsed_s, (progress.doing, ended)
-            self._console.print(printable("; ".join(lines)), highlight=False, soft_wrap=True, markup=False)
+            self._console.print(Text(printable("; ".join(lines))), soft_wrap=True)
 
 
 def show_summary(summary: Mapping[str, Any]) -> None:
@@ -115,7 +115,7 @@ def show_summary(summary: Mapping[str, Any]) -> None:
     for c in summary["criteria"]:
         if not c["met"]:
             said = one_line(f"not met: {c['what']} {c['limit']}, got {c['value']}")
-            console.print(said, style="red", highlight=False, markup=False)
+            console.print(Text(said, style="red"))
     console.print("passed" if summary["passed"] else "not passed", style="green" if summary["passed"] else "red")
 
 

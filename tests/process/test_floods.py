@@ -95,7 +95,9 @@ def flooded(tmp_path_factory: pytest.TempPathFactory) -> Flooded:
                     count = due
                     if asked_s is None and since_s > 0.5 * FLOOD_S:
                         asked_s = time.monotonic()
-                        assert operator.command("resume").all_accepted
+                        # Whether it is accepted is the flight's affair: a vehicle whose autopilot this machine has held
+                        # up is released by then.
+                        assert not operator.command("resume").silent
                         flooded.answered[name] = time.monotonic() - asked_s
                     pause.wait(0.002)
                 flooded.windows[name] = begin_ns, time.time_ns()

@@ -220,6 +220,10 @@ def test_three_companions_in_one_process_fly_on_the_transport_in_memory(tmp_path
         assert operator.take_off().all_accepted
         said = wait_status(operator, all_in(fleet.ids, *SETTLED))
         assert all(s.neighbours == 2 and (s.nearest_m or 0.0) > 1.0 for s in said.values())
+        flying[1].network.inbox.count("publish_failures")  # type: ignore[attr-defined]
+        flying[1].network.inbox.count("reply_failures")  # type: ignore[attr-defined]
+        told = wait_status(operator, lambda said: "peer: could not be sent" in said[1].rejected)[1].rejected
+        assert (told["peer: could not be sent"], told["operator: could not be answered"]) == (1, 1)
         assert operator.land().all_accepted
         wait_status(operator, all_in(fleet.ids, "landed"))
     assert statuses == dict.fromkeys(fleet.ids, 0)

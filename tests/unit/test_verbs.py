@@ -8,7 +8,10 @@ import pytest
 from typer.testing import CliRunner
 
 import companion.__main__
+import companion.io.network
 import sim.__main__
+from companion.errors import CompanionError, RefusedError
+from companion.io.transport import TransportError
 
 VERBS = {
     "init",
@@ -77,6 +80,24 @@ def test_wrong_usage_is_one_sentence_and_a_status_of_its_own(
     assert err.startswith(f"{command}: ")
     assert said in err
     assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize("error", [TransportError("no network"), RefusedError("not yet"), CompanionError("no line")])
+@pytest.mark.parametrize("command", ["companion", "fleet"])
+def test_both_commands_end_alike_where_nobody_could_be_commanded(
+    command: str, error: CompanionError, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fails(config: object) -> None:
+        raise error
+
+    monkeypatch.setattr(companion.io.network, "operator_link", fails)
+    main = companion.__main__.main if command == "companion" else sim.__main__.main
+    verb = [*(["operator"] if command == "companion" else []), "land", "--fleet", FLEET_TOML]
+    monkeypatch.setattr(sys, "argv", [command, *verb])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 1
+    assert capsys.readouterr().err == f"{command}: {error}\n"
 
 
 def test_a_kill_that_nobody_confirms_commands_nobody() -> None:
