@@ -10,6 +10,7 @@ RESOLUTION_M. The work is counted in looks and ends at LOOKS_MAX: a motion that 
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from math import dist, hypot, inf, isfinite, pi
 from typing import NamedTuple
 
@@ -40,6 +41,8 @@ EDGE_LOOKS, NOTCHED_EDGE_LOOKS = 0.1, 0.25
 """cost of one edge of a polygon over that of the place"""
 DEPTH_PARTS = 24
 """a leg that leads outside is looked at in so many parts, and its worst part again, to tell how far it leads"""
+DEPTH_SHARE = 0.3
+"""of the most looks: what that may cost; beside a fence of many corners the parts are fewer"""
 TOLERANCE_M = 1e-6
 
 
@@ -140,6 +143,31 @@ def _aligned(a: Ned, b: Ned) -> bool:
     return across == (0.0, 0.0, 0.0) and a.north * b.north + a.east * b.east + a.down * b.down >= 0.0
 
 
+@dataclass
+class _Moment:
+    """The motion at one time, between two pieces of its way: what both ask of the slots there is computed once."""
+
+    fleet_ns: int
+    motion: FleetTrajectory
+    fence: Fence
+    state: TrajectoryState
+
+    @cached_property
+    def places(self) -> list[Ned]:
+        """Where the slots are."""
+        return [self.state.slot(change).position_ned_m for change in self.motion.slots.values()]
+
+    @cached_property
+    def vertical_room_m(self) -> float:
+        """Least room of any slot to floor and ceiling."""
+        return min(self.fence.vertical_room_m(p.down) for p in self.places)
+
+    @cached_property
+    def room_m(self) -> float:
+        """Least room of any slot."""
+        return min(self.fence.room_m(p) for p in self.places)
+
+
 @dataclass(slots=True)
 class _March:
     """One examination of a motion."""
@@ -201,26 +229,27 @@ class _March:
 
     def inside(self, span: _Span) -> bool:
         """Whether every slot stays inside over a span; also False once the looks are used up."""
-        moment = self.motion.state_at
-        stack = [(span.start_ns, moment(span.start_ns), span.end_ns, moment(span.end_ns))]
+        stack = [(self._moment(span.start_ns), self._moment(span.end_ns))]
         while stack:
-            start_ns, first, end_ns, last = stack.pop()
+            first, last = stack.pop()
+            start_ns, end_ns = first.fleet_ns, last.fleet_ns
             self.looks += self._centre_cost
             if self.exhausted:
                 return False
             seconds = (end_ns - start_ns) * 1e-9
             strip = 0.125 * self._bend_m_s2(span, start_ns, end_ns) * seconds * seconds
-            if self._all_inside(first, last, strip):
+            if self._all_inside(first.state, last.state, strip):
                 continue
             least, wide = self._slots_inside(first, last, strip)
             if least >= self.allowed_m:
                 continue
-            if not self._ends_inside(first, last):
+            self.looks += self._slots_cost
+            if not (first.room_m >= self.allowed_m and last.room_m >= self.allowed_m):
                 return False
             middle_ns = (start_ns + end_ns) // 2
             if wide > RESOLUTION_M and start_ns < middle_ns < end_ns:
-                middle = moment(middle_ns)
-                stack += [(middle_ns, middle, end_ns, last), (start_ns, first, middle_ns, middle)]
+                middle = self._moment(middle_ns)
+                stack += [(middle, last), (first, middle)]
         return True
 
     def _all_inside(self, first: TrajectoryState, last: TrajectoryState, strip: float) -> bool:
@@ -235,36 +264,28 @@ class _March:
             and fence.edge_room_along_m(a.north, a.east, b.north, b.east) - self._level_m >= need
         )  # fmt: skip
 
-    def _slots_inside(self, first: TrajectoryState, last: TrajectoryState, strip: float) -> tuple[float, float]:
+    def _moment(self, fleet_ns: int) -> "_Moment":
+        return _Moment(fleet_ns, self.motion, self.fence, self.motion.state_at(fleet_ns))
+
+    def _slots_inside(self, first: "_Moment", last: "_Moment", strip: float) -> tuple[float, float]:
         """Least room of the strips about the slots' ways, and how wide or (beside a notch) how long what may be halved
         is."""
         self.looks += 2.0 * self._slots_cost
-        fence, convex = self.fence, self.fence.convex
-        least, wide = inf, strip
-        for change in self.motion.slots.values():
-            a, b = first.slot(change).position_ned_m, last.slot(change).position_ned_m
-            least = min(
-                least, fence.vertical_room_m(a.down), fence.vertical_room_m(b.down),
-                fence.edge_room_along_m(a.north, a.east, b.north, b.east),
-            )  # fmt: skip
+        convex, edge_room_along_m = self.fence.convex, self.fence.edge_room_along_m
+        least, wide = min(first.vertical_room_m, last.vertical_room_m), strip
+        for a, b in zip(first.places, last.places, strict=True):
+            least = min(least, edge_room_along_m(a.north, a.east, b.north, b.east))
             if not convex:
                 wide = max(wide, hypot(b.north - a.north, b.east - a.east))
         return least - strip, wide
-
-    def _ends_inside(self, first: TrajectoryState, last: TrajectoryState) -> bool:
-        self.looks += self._slots_cost
-        return all(
-            self.fence.room_m(moment.slot(change).position_ned_m) >= self.allowed_m
-            for change in self.motion.slots.values()
-            for moment in (first, last)
-        )
 
     def deepest(self, spans: list[_Span]) -> Breach | None:
         """How far the spans of one leg lead outside at most."""
         worst: Breach | None = None
         start_ns, end_ns = spans[0].start_ns, spans[-1].end_ns
+        parts = min(max(int(DEPTH_SHARE * self._looks_max / (2.0 * self._slots_cost)), 2), DEPTH_PARTS)
         for _ in range(2):
-            step_ns = max((end_ns - start_ns) // DEPTH_PARTS, 1)
+            step_ns = max((end_ns - start_ns) // parts, 1)
             for at_ns in (*range(start_ns, end_ns, step_ns), end_ns):
                 room, vehicle = self.least_room(at_ns)
                 if room < self.allowed_m and (worst is None or -room > worst.outside_m):

@@ -20,6 +20,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.stats import beta
 
+from companion.config.law_tables import LAWS
+from companion.config.registry import Origin
 from companion.errors import ConfigError
 from sim.swarm.setup import Setup, connected, setup_from
 from sim.swarm.swarm import Run, kernels
@@ -40,6 +42,8 @@ FLYING_CODE = tuple(
 MESSAGE_BYTES = 59
 DIGEST_ENTRY_BYTES = 38
 INTENT_EXTRA_BYTES = 36
+TOLD_BYTES = 4
+"""of each number that a law adds to its messages, and a byte for their count"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,10 +203,22 @@ def fingerprint(config: Config) -> str:
         from sim.swarm.compiled import source_hash
 
         digest.update(source_hash().encode())
+        digest.update(json.dumps(foreign_laws(config.values)).encode())
     module = study_module(config.name)
     for path in (module.__file__, *getattr(module, "SOURCES", ())):
         digest.update(Path(str(path)).read_bytes())
     return digest.hexdigest()
+
+
+def foreign_laws(values: Any) -> list[Origin]:
+    """The laws of other packages that a set-up names, wherever in it."""
+    if not isinstance(values, Mapping):
+        return []
+    name = values.get("law")
+    found = {o for v in values.values() for o in foreign_laws(v)}
+    if isinstance(name, str) and LAWS.table(name) is not None and (origin := LAWS.origin(name)) is not None:
+        found.add(origin)
+    return sorted(found)
 
 
 def _piece(name: str, text: str, seed: int) -> Record:
@@ -255,6 +271,7 @@ def write_outcome(config: Config, outcome: Outcome, seeds: Sequence[int], out: P
         "study": config.name,
         "seeds": list(seeds),
         "setup": config.values,
+        "foreign": [o._asdict() for o in foreign_laws(config.values)],
         **outcome.values,
         "tables": {t.name: t.rows for t in outcome.tables},
         "findings": outcome.findings,
@@ -287,7 +304,10 @@ def payload_bytes(run: Run) -> int:
     """Payload of every message of a run, digests included."""
     entries = run.samples_sent - run.messages
     extra = INTENT_EXTRA_BYTES if run.setup.law == "intent" else 0
-    return run.messages * (MESSAGE_BYTES + extra) + entries * (DIGEST_ENTRY_BYTES + extra)
+    table = run.setup.law_table()
+    fields = 0 if table is None else len(table.law(run.setup.r0_m).fields)
+    told = 1 + TOLD_BYTES * fields if fields else 0
+    return run.messages * (MESSAGE_BYTES + extra + told) + entries * (DIGEST_ENTRY_BYTES + extra)
 
 
 def fewer_percent(messages: float, setup: Setup) -> float:

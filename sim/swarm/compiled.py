@@ -9,9 +9,10 @@ from typing import Any, TypeVar, cast
 import numba
 from numba import config as numba_config
 
+from companion.config import law_tables
 from companion.core import estimate, values, vectors
 from companion.core import prediction as hold
-from companion.core.law import consensus, intent
+from companion.core.law import consensus, intent, paper
 from companion.core.law import starling as law
 from companion.core.neighbours import gates
 from companion.core.safety import filter as safety
@@ -23,8 +24,8 @@ from sim.swarm.state import Floats
 F = TypeVar("F", bound=Callable[..., Any])
 
 _MODULES = (
-    baselines, consensus, error, estimate, gates, hold, intent, law, periodic, program, safety, switching, values,
-    vectors,
+    baselines, consensus, error, estimate, gates, hold, intent, law, law_tables, paper, periodic, program, safety,
+    switching, values, vectors,
 )  # fmt: skip
 
 

@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 
+from companion.core.law.base import FIELDS_MAX
 from companion.core.law.intent import IntentGains, IntentTrigger
 from companion.core.prediction import Weights
 from companion.core.trigger.error import ErrorTrigger
@@ -39,6 +40,7 @@ from sim.swarm.state import (
     PERIODIC,
     SAMPLE,
     SWITCHING,
+    TOLD,
     Floats,
     Options,
     State,
@@ -126,6 +128,8 @@ def compose(i: int, k: int, s: State, ref: Floats, o: Options) -> None:
             s.sent[i, c] = p
             s.sent[i, 3 + c] = v
             s.sent[i, 6 + c] = s.common[i, c]
+    for c in range(FIELDS_MAX):
+        s.sent[i, TOLD + c] = s.told[i, c]
     s.sent_step[i] = k
 
 
@@ -243,10 +247,10 @@ def _digest(i: int, at: int, k: int, s: State, o: Options) -> None:
 
 
 @kernel
-def _store(e: int, sample: Floats, step: int, s: State) -> None:
+def _store(e: int, sample: Floats, step: int, size: int, s: State) -> None:
     if step > s.held_step[e]:
         s.held_step[e] = step
-        for c in range(SAMPLE):
+        for c in range(size):
             s.held[e, c] = sample[c]
 
 
@@ -280,7 +284,7 @@ def deliver(k: int, tick: int, s: State, o: Options) -> None:
             lost = s.outage[e] == 1 if o.burst > 0.0 else uniform(s.keys[i, 4], k * n + j) < o.loss
             if lost:
                 continue
-            _store(e, s.ring[at, j], s.ring_step[at, j], s)
+            _store(e, s.ring[at, j], s.ring_step[at, j], SAMPLE, s)
             for d_at in range(o.digest):
                 about = s.ring_digest_id[at, j, d_at]
                 if about < 0:
@@ -288,7 +292,7 @@ def deliver(k: int, tick: int, s: State, o: Options) -> None:
                 if about != i:
                     # row i lists every other agent in ascending order
                     _store(s.start[i] + about - (1 if about > i else 0), s.ring_digest[at, j, d_at],
-                           s.ring_digest_step[at, j, d_at], s)  # fmt: skip
+                           s.ring_digest_step[at, j, d_at], TOLD, s)  # fmt: skip
 
 
 @kernel

@@ -244,6 +244,19 @@ def intended(
     return within_budget(sums.sep_x, sums.sep_y, sums.sep_z, b0, b1, b2, g.a_max)
 
 
+@inlined
+def keep_apart(
+    i: int, count: int, u0: float, u1: float, u2: float, shared: Ned, s: State, o: Options
+) -> None:  # fmt: skip
+    """The command of agent i, after the safety filter if it is on, into s.u; see `look`."""
+    if o.barrier == 1:
+        q = s.measured[i]
+        true = VehicleState(0, Ned(q[0], q[1], q[2]), Ned(q[3], q[4], q[5]))
+        kept = constrain(u0, u1, true, shared, s.near, count, o.avoidance_max, s.planes, s.spare)
+        u0, u1 = kept.north, kept.east
+    s.u[i, 0], s.u[i, 1], s.u[i, 2] = u0, u1, u2
+
+
 @kernel
 def command(k: int, s: State, ref: Floats, o: Options, g: Gains, ig: IntentGains) -> None:
     """Law and safety filter of every agent at step k, into s.u; and the estimates that go with them."""
@@ -276,14 +289,7 @@ def command(k: int, s: State, ref: Floats, o: Options, g: Gains, ig: IntentGains
             s.residual[i, 0], s.residual[i, 1], s.residual[i, 2] = residual.north, residual.east, residual.down
         if o.leaderless == 1:
             agree(i, count, dt, s, o)
-        if o.barrier == 1:
-            q = s.measured[i]
-            true = VehicleState(0, Ned(q[0], q[1], q[2]), Ned(q[3], q[4], q[5]))
-            kept = constrain(
-                u0, u1, true, reference.acceleration_ned_m_s2, s.near, count, o.avoidance_max, s.planes, s.spare
-            )
-            u0, u1 = kept.north, kept.east
-        s.u[i, 0], s.u[i, 1], s.u[i, 2] = u0, u1, u2
+        keep_apart(i, count, u0, u1, u2, reference.acceleration_ned_m_s2, s, o)
 
 
 @kernel
@@ -365,28 +371,43 @@ def watch(s: State, o: Options, et: ErrorTrigger) -> None:
 
 
 @kernel
+def exchange(
+    k: int, keep_every: int, s: State, ref: Floats, o: Options, ig: IntentGains,
+    et: ErrorTrigger, st: SwitchingTrigger, it: IntentTrigger,
+) -> None:  # fmt: skip
+    """Step k up to the laws: the state is kept, and in a control period measured, sent and predicted."""
+    if k % keep_every == 0 and k // keep_every < s.record.shape[0]:
+        for i in range(s.x.shape[0]):
+            for c in range(3):
+                s.record[k // keep_every, i, c] = s.x[i, c]
+                s.record[k // keep_every, i, 3 + c] = s.v[i, c]
+    if k % o.every == 0:
+        tick = k // o.every
+        place_slots(k, s, ref)
+        measure(k, s, o)
+        filter_own(k, s, o)
+        send(k, tick, s, ref, o, et, st, it, ig)
+        if o.links == 1:
+            deliver(k, tick, s, o)
+        predict_all(k, s, ref, o, ig)
+
+
+@kernel
+def fly(k: int, s: State, o: Options, et: ErrorTrigger) -> None:
+    """Step k after the laws."""
+    if k % o.every == 0 and o.dense_measures == 1:
+        watch(s, o, et)
+    move(k, s, o)
+
+
+@kernel
 def advance(
     k0: int, k1: int, keep_every: int, s: State, ref: Floats, o: Options, g: Gains, ig: IntentGains,
     et: ErrorTrigger, st: SwitchingTrigger, it: IntentTrigger,
 ) -> None:  # fmt: skip
     """Steps k0 .. k1 - 1 of a run."""
-    n = s.x.shape[0]
     for k in range(k0, k1):
-        if k % keep_every == 0 and k // keep_every < s.record.shape[0]:
-            for i in range(n):
-                for c in range(3):
-                    s.record[k // keep_every, i, c] = s.x[i, c]
-                    s.record[k // keep_every, i, 3 + c] = s.v[i, c]
+        exchange(k, keep_every, s, ref, o, ig, et, st, it)
         if k % o.every == 0:
-            tick = k // o.every
-            place_slots(k, s, ref)
-            measure(k, s, o)
-            filter_own(k, s, o)
-            send(k, tick, s, ref, o, et, st, it, ig)
-            if o.links == 1:
-                deliver(k, tick, s, o)
-            predict_all(k, s, ref, o, ig)
             command(k, s, ref, o, g, ig)
-            if o.dense_measures == 1:
-                watch(s, o, et)
-        move(k, s, o)
+        fly(k, s, o, et)

@@ -5,11 +5,14 @@ Nothing here needs numba.
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal, get_args, get_origin
 
 import numpy as np
+from pydantic import ValidationError
 
+from companion.config.law_tables import LAWS, LawTable
+from companion.config.messages import sentence
 from companion.core.formation import SHAPES
 from companion.core.law.intent import IntentGains, IntentTrigger
 from companion.core.law.starling import Gains
@@ -94,7 +97,7 @@ class Formation:
         return np.asarray(d - d.mean(axis=0))
 
 
-Law = Literal["flown", "intent"]
+COMPILED_LAWS = ("flown", "intent")
 Hold = Literal["zero", "first", "damped", "observer"]
 Trigger = Literal["error", "switching", "periodic", "float clock", "classic", "elastic", "intent"]
 Reading = Literal["V0", "V1", "V1b", "V2"]
@@ -125,7 +128,11 @@ class Setup:
     scrambled: bool = False
     """agents start at each other's slots, so that their paths cross"""
 
-    law: Law = "flown"
+    law: str = "flown"
+    """flown or intent, which are compiled; or a `law.kind` of fleet.toml, an installed package's too, of which each
+    agent's plain `command` is called"""
+    law_parameters: Mapping[str, Any] = field(default_factory=dict)
+    """what [law] of fleet.toml says of such a kind, but for hold, damping, limit and range, which stand below"""
     hold: Hold = "damped"
     damping_s: float = 0.7
     k_s: float = 3.0
@@ -222,11 +229,34 @@ class Setup:
         _check(0 <= self.loss < 1, "loss", self.loss, "in [0, 1)")
         _check(self.control_every >= 1, "control_every", self.control_every, "at least 1")
         _check(0 <= self.digest <= DIGEST_MAX, "digest", self.digest, f"in 0..{DIGEST_MAX}")
+        self.law_table()
         if self.per_link and self.formation.count > DENSE_MAX:
             raise ConfigError(
                 f"formation.count must be <= {DENSE_MAX} with loss, delay or digests (every pair has its own memory), "
                 f"got {self.formation.count}"
             )
+
+    def law_table(self) -> LawTable | None:
+        """The table of a law whose plain `command` is called; None for a compiled one."""
+        if self.law in COMPILED_LAWS:
+            return None
+        where = f"law = {self.law!r}"
+        if LAWS.table(self.law) is None:
+            raise ConfigError(f"law must be one of {', '.join((*COMPILED_LAWS, *LAWS.known()))}, got {self.law!r}")
+        if self.reading != "V2" or self.separation != "cut" or not self.plan:
+            raise ConfigError(f"{where} flies a plan (plan = true) and knows one reading: reading V2, separation cut")
+        shared = {
+            "kind": self.law, "hold": self.hold, "hold_damping_s": self.damping_s, "a_max_m_s2": self.a_max_m_s2,
+            "r0_m": self.r0_m,
+        }  # fmt: skip
+        if twice := shared.keys() & self.law_parameters:
+            raise ConfigError(f"{where}: not under law_parameters but beside it: {', '.join(sorted(twice))}")
+        values = {**shared, **self.law_parameters}
+        try:
+            return LAWS.validate(values)
+        except ValidationError as error:
+            faults = [sentence({**e, "loc": ("law", *e["loc"])}, {"law": values}) for e in error.errors()]
+            raise ConfigError(f"{where}: {'; '.join(f.removeprefix('$.law.') for f in faults)}") from None
 
     @property
     def per_link(self) -> bool:
@@ -282,8 +312,11 @@ def _filled(base: Any, values: Mapping[str, Any], where: str) -> Any:
         kind = known[name]
         if get_origin(kind) is Literal and value not in get_args(kind):
             raise ConfigError(f"{where}.{name} must be one of {', '.join(get_args(kind))}, got {value!r}")
-        if (kind is bool) != isinstance(value, bool) or (
-            (kind in (int, float) and not isinstance(value, int | float))
+        if (
+            (kind is bool) != isinstance(value, bool)
+            or (kind is str and not isinstance(value, str))
+            or (get_origin(kind) is Mapping) != isinstance(value, Mapping)
+            or (kind in (int, float) and not isinstance(value, int | float))
             or (kind is int and not isinstance(value, int))
         ):
             raise ConfigError(f"{where}.{name} must be {getattr(kind, '__name__', kind)}, got {value!r}")

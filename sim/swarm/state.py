@@ -5,14 +5,18 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from companion.core.law.base import FIELDS_MAX
+
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.uint8]
 
 HOLD_ZERO, HOLD_FIRST, HOLD_DAMPED, HOLD_OBSERVER = 0, 1, 2, 3
 ERROR, SWITCHING, PERIODIC, FLOAT_CLOCK, CLASSIC, ELASTIC, INTENT = 0, 1, 2, 3, 4, 5, 6
-SAMPLE = 15
-"""floats of a sample: flown law p, v, nu; published intent c, g, w, e, e'"""
+TOLD = 15
+"""floats of a sample that others pass on: flown law p, v, nu; published intent c, g, w, e, e'"""
+SAMPLE = TOLD + FIELDS_MAX
+"""floats of a sample: those, and what a law adds to its own messages"""
 DIGEST_MAX = 16
 """most samples of peers that a message carries"""
 ROW = 22
@@ -129,6 +133,8 @@ class State(NamedTuple):
     """mean residual of the last control period (N, 3)"""
     neighbours: Floats
     """how many took part in it (N,)"""
+    told: Floats
+    """what each agent's law adds to its next message (N, FIELDS_MAX)"""
     observed: Floats
     """observer of the elastic baseline (N, 6)"""
     predicted: Floats

@@ -7,14 +7,16 @@ sorted list of the neighbours within range, with a skin of 1 m, is rebuilt when 
 and no array has N x N entries.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import lru_cache
 from types import ModuleType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 
+from companion.core.law.base import FIELDS_MAX
 from companion.errors import ConfigError
 from sim.swarm.neighbour_list import NeighbourList
 from sim.swarm.setup import DENSE_MAX, Setup, connected, rules_of, run_options
@@ -175,6 +177,7 @@ def state_of(
         filtered=np.zeros((n, 6)), u=np.zeros((n, 3)), common=np.zeros((n, 3)), anchor=np.zeros((n, 3)),
         anchor_speed=np.zeros((n, 3)), sent=np.zeros((n, SAMPLE)), sent_step=np.full(n, -1, dtype=np.int64),
         limit=np.zeros(n), clock=np.zeros(n), own=np.zeros((n, 12)), residual=np.zeros((n, 3)), neighbours=np.zeros(n),
+        told=np.zeros((n, FIELDS_MAX)),
         observed=np.zeros((n, 6)), predicted=np.zeros((rows, 12)),
         held=np.zeros((rows if o.links else 1, SAMPLE)),
         held_step=np.full(rows if o.links else 1, -1, dtype=np.int64), stopped=np.zeros((rows, 3)),
@@ -195,13 +198,24 @@ def state_of(
     return s
 
 
+def _advance(setup: Setup) -> Callable[..., None]:
+    """What takes the agents on by some steps: the compiled loop, or the one that calls plain laws."""
+    loops = kernels()
+    table = setup.law_table()
+    if table is None:
+        return cast(Callable[..., None], loops.advance)
+    from sim.swarm.plain_law import PlainLaws
+
+    return PlainLaws(table, setup.formation.count, setup.r0_m).advance
+
+
 def run(setup: Setup, seed: int, *, reference: Floats | None = None, start: tuple[Floats, Floats] | None = None) -> Run:
     """Fly one set-up under one seed. `reference`, shape (steps, 1 or N, 9), replaces the plan's table."""
     if not connected(setup.formation.slots(), setup.range_m):
         raise ConfigError(
             f"the formation is not connected at range_m = {setup.range_m} m: raise range_m or bring the slots closer"
         )
-    loops = kernels()
+    advance = _advance(setup)
     n = setup.formation.count
     steps = round(setup.duration_s / setup.dt_s)
     table = reference_table(setup, steps + 1) if reference is None else reference
@@ -211,11 +225,11 @@ def run(setup: Setup, seed: int, *, reference: Floats | None = None, start: tupl
     near = None if n <= DENSE_MAX else NeighbourList(setup.range_m)
     s = state_of(setup, seed, o, table, x, v, slots, near)
     if near is None:
-        loops.advance(0, steps, setup.keep_every, s, table, o, *rules)
+        advance(0, steps, setup.keep_every, s, table, o, *rules)
     else:
         for k in range(steps):
             s = with_list(s, near)
-            loops.advance(k, k + 1, setup.keep_every, s, table, o, *rules)
+            advance(k, k + 1, setup.keep_every, s, table, o, *rules)
     if s.counts[0] > len(s.events):
         raise RuntimeError(f"{s.counts[0]} events, room for {len(s.events)}")
     kept = len(s.record)

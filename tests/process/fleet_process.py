@@ -132,10 +132,10 @@ class Process:
         return self.err_file.read_text()
 
 
-def run(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
+def run(*arguments: str, folder: Path, timeout_s: float = PATIENCE_S) -> subprocess.CompletedProcess[str]:
     """A command to its end."""
     return subprocess.run(
-        [sys.executable, "-P", "-m", *arguments], cwd=folder, capture_output=True, text=True, timeout=PATIENCE_S,
+        [sys.executable, "-P", "-m", *arguments], cwd=folder, capture_output=True, text=True, timeout=timeout_s,
         check=False, stdin=subprocess.DEVNULL,
     )  # fmt: skip
 

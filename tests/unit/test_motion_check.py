@@ -4,7 +4,7 @@ import json
 import random
 from collections.abc import Callable
 from dataclasses import replace
-from math import hypot, inf, pi, radians
+from math import cos, hypot, inf, pi, radians, sin
 from pathlib import Path
 from typing import Any
 
@@ -224,6 +224,22 @@ def test_the_hardest_motions_known_take_bounded_looks_and_long_surveys_pass() ->
     fault, looks = examine(survey_from, LIMITS, FORMED)
     assert fault is None
     assert looks < LOOKS_MAX / 2
+
+
+def test_telling_how_far_a_motion_leads_outside_a_fence_of_many_notches_costs_no_more_than_finding_it() -> None:
+    ring = [(200.0 - 12.0 * (k % 2), pi * k / 60) for k in range(120)]
+    corners = [[r * cos(angle), r * sin(angle)] for r, angle in ring]
+
+    def change(tables: dict[str, Any]) -> None:
+        del tables["fence"]["radius_m"]
+        tables["fence"]["polygon_m"] = corners
+
+    limits = load(FILE, change).motion_limits
+    fault, looks = examine(flown(AHEAD, GotoLeg(Ned(250.0, 0.0, -10.0), 300.0)), limits, FORMED)
+    assert fault is not None
+    assert fault.breach is not None
+    assert fault.breach.outside_m > 40.0
+    assert looks < 1.5 * LOOKS_MAX
 
 
 # -- what is refused, and by which words -----------------------------------------------------------------------------

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from foreign import EXAMPLE, install
 from rich.console import Console
 
 pytest.importorskip("numba")
@@ -252,3 +253,19 @@ def test_a_head_on_set_up_with_missing_or_unknown_keys_is_refused(missing: str, 
     given = {k: v for k, v in config.values["meeting"].items() if k != missing} | ({more: 2.0} if more else {})
     with pytest.raises(ConfigError, match=f"wrong: {missing or more}$"):
         headon.meeting_of(replace(config, values={"meeting": given}))
+
+
+def test_the_law_of_another_package_is_found_wherever_in_a_setup_and_is_part_of_what_names_finished_seeds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(install(EXAMPLE, tmp_path / "site")))
+    ours = {"base": {"law": "flown"}, "cases": {"a": {"law": "starling", "law_parameters": {"k_s": 1.0}}}}
+    assert common.foreign_laws(ours) == []
+    (found,) = common.foreign_laws({**ours, "schemes": {"b": {"law": "springs"}, "c": {"law": "springs"}}})
+    assert (found.kind, found.package) == ("springs", "starling-springs")
+    config = load_config("table3")
+    marks = set()
+    for origins in ([], [found], [found._replace(source="other")]):
+        monkeypatch.setattr(common, "foreign_laws", lambda _, o=origins: o)
+        marks.add(common.fingerprint(config))
+    assert len(marks) == 3

@@ -1,8 +1,11 @@
 """The compiled swarm: its random streams, neighbour list, network and measures."""
 
 import math
-from dataclasses import replace
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -10,8 +13,10 @@ import pytest
 pytest.importorskip("numba")
 
 from companion.config import load
+from companion.config.law_tables import LawTable
 from companion.core.frames import Ned
 from companion.core.law import starling as law
+from companion.core.law.base import Wanted
 from companion.core.law.intent import IntentGains, response
 from companion.core.law.paper import paper_gains
 from companion.core.neighbours.sample import predict_sample
@@ -27,6 +32,7 @@ from companion.errors import ConfigError
 from sim.swarm import compiled as core
 from sim.swarm.exchange import hold_weights
 from sim.swarm.neighbour_list import NeighbourList
+from sim.swarm.plain_law import PlainLaws
 from sim.swarm.rows import CompiledLaw, as_rows, constrain
 from sim.swarm.setup import Formation, Setup, rules_of, run_options, setup_from
 from sim.swarm.state import HOLD_DAMPED, HOLD_FIRST, HOLD_ZERO
@@ -306,3 +312,77 @@ def test_starts_stay_in_their_ball_and_keep_their_separation() -> None:
     assert np.linalg.norm(x - setup.formation.slots(), axis=1).max() <= 3.0
     gaps = np.linalg.norm(x[:, None] - x[None, :], axis=2) + 10 * np.eye(len(x))
     assert gaps.min() >= 1.5
+
+
+def test_our_law_called_as_a_vehicle_calls_it_flies_as_the_compiled_one() -> None:
+    """One agent is pushed on the level, where both act alike; then every gain, separation and the filter take part."""
+    calm = replace(SHORT, duration_s=6.0, start_ball_m=0.0, start_velocity_m_s=0.0, k_a=3.0, k_c=4.0, k_p=0.3)
+    pushed = replace(calm, push_time_s=1.0, push_m_s=(2.0, 1.5, 0.0), barrier=True, loss=0.2, delay_s=0.05, digest=9)
+    compiled, plain = run(pushed, 3), run(replace(pushed, law="starling"), 3)
+    assert np.abs(plain.position_m - compiled.position_m).max() < 1e-9
+    assert np.array_equal(plain.events, compiled.events)
+    assert compiled.formation_error_m().max() > 0.3, "the push shows"
+
+
+class CountsTable(LawTable):
+    """A law that counts its calls, tells the count, and keeps what it hears."""
+
+    kind: Literal["counts"] = "counts"
+
+    def law(self, r0_m: float) -> "Counts":
+        return Counts()
+
+
+@dataclass
+class Counts:
+    calls: int = 0
+    heard: list[set[tuple[float, ...]]] = field(default_factory=list)
+    fields: tuple[str, ...] = ("calls", "half")
+
+    def command(
+        self, ego: VehicleState, reference: Reference, neighbours: Sequence[Neighbour], *, alone: bool
+    ) -> Wanted:
+        self.calls += 1
+        self.heard.append({n.told for n in neighbours})
+        return Wanted(ZERO, ZERO)
+
+    def reset(self) -> None:
+        self.calls = 0
+
+    def tell(self) -> tuple[float, ...]:
+        return (float(self.calls), 0.5)
+
+
+@pytest.mark.parametrize(("delay_s", "periods"), [(0.0, 0), (0.03, 3)])
+def test_what_a_law_tells_reaches_the_others_with_its_next_message(delay_s: float, periods: int) -> None:
+    setup = replace(SHORT, trigger="periodic", period_s=0.01, t_min_s=0.0, delay_s=delay_s)
+    table, o = reference_table(setup, 101), run_options(setup)
+    x, v = starts(setup, 1)
+    s = state_of(setup, 1, o, table, x, v, setup.formation.slots(), None)
+    laws = PlainLaws(CountsTable(), setup.formation.count, setup.r0_m)
+    laws.advance(0, 100, 5, s, table, o, *rules_of(setup))
+    for guest in laws.laws:
+        assert isinstance(guest.law, Counts)
+        assert guest.law.heard[:periods] == [set()] * periods, "nothing has come yet"
+        assert guest.law.heard[periods:] == [{(float(k), 0.5 if k else 0.0)} for k in range(100 - periods)]
+
+
+@pytest.mark.parametrize(
+    ("values", "sentence"),
+    [
+        ({"law": "flocks"}, "law must be one of flown, intent, starling, paper"),
+        ({"law": "starling", "law_parameters": {"k_s": -1.0}}, "law = 'starling': k_s must be a finite number >= 0"),
+        ({"law": "starling", "law_parameters": {"k_q": 1.0}}, "law = 'starling': k_q is not a known key"),
+        ({"law": "starling", "a_max_m_s2": 1.0}, "law = 'starling': a_max_m_s2 must be a finite number >= 2"),
+        ({"law": "starling", "law_parameters": {"r0_m": 2.0}}, "not under law_parameters but beside it: r0_m"),
+        ({"law": "starling", "plan": False}, "flies a plan"),
+        ({"law": "starling", "reading": "V0"}, "reading V2"),
+        ({"law": 3}, "x.law must be str, got 3"),
+        ({"law_parameters": 3}, "x.law_parameters must be"),
+    ],
+)
+def test_a_law_that_is_not_there_or_does_not_fit_is_refused_with_a_sentence(
+    values: dict[str, Any], sentence: str
+) -> None:
+    with pytest.raises(ConfigError, match=re.escape(sentence)):
+        setup_from(values, "x")
