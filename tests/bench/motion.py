@@ -68,7 +68,10 @@ def notched() -> list[list[float]]:
     return corners
 
 
-FENCES = {"cylinder": {"radius_m": EDGE_M}, f"polygon of {2 * NOTCHES} corners": {"polygon_m": notched()}}
+FENCES: dict[str, dict[str, Any]] = {
+    "cylinder": {"radius_m": EDGE_M},
+    f"polygon of {2 * NOTCHES} corners": {"polygon_m": notched()},
+}
 
 
 def drawn(r: random.Random, before: FleetTrajectory) -> FleetTrajectory:
@@ -82,9 +85,10 @@ def drawn(r: random.Random, before: FleetTrajectory) -> FleetTrajectory:
         goto = GotoLeg(Ned(edge * cos(angle), edge * sin(angle), -10.0), r.choice([20.0, 60.0, 300.0]))
         turn = TurnLeg(r.choice([0.01, 0.1, -0.1, 0.3]), r.choice([0.5, 1.0, pi, 600.0]))
         side = VelocityLeg(Ned(0.0, r.choice([-1.0, 1.0]) * r.choice([0.2, 1.0, 2.9]), 0.0), r.choice([0.5, 5.0, 60.0]))
-        legs.append({"goto": goto, "turns": turn, "sides": side}.get(family) or r.choice([goto, turn, side]))
+        of_family: dict[str, Leg] = {"goto": goto, "turns": turn, "sides": side}
+        legs.append(of_family[family] if family in of_family else r.choice(list(of_family.values())))
     slots = {i: SlotChange(c.after, c.before) for i, c in before.slots.items()} if changes else before.slots
-    motion = with_legs(before, at_ns=START_NS + 3 * 10**9, issuer=0, legs=legs)
+    motion = with_legs(before, at_ns=START_NS + 3 * 10**9, issuer=0, legs=tuple(legs))
     return replace(
         motion, centre_ned_m=Ned(edge, 0.0, -10.0), heading_follows_turns=follows, slots=slots,
         blend_start_ns=motion.start_ns, blend_s=r.choice([8.0, 60.0, 600.0, 80_000.0]) if changes else 0.0,

@@ -19,6 +19,7 @@ from pymavlink.dialects.v20 import development as dialect
 from companion.core.trajectory.history import TrajectoryHistory
 from companion.io.recorder import read_recording
 from companion.operator.client import Operator
+from companion.wire.operator import Status
 from companion.wire.px4 import Px4Mode, mode_parameters
 from sim.autopilot.stubs import TRUTH_DTYPE
 from sim.launch.summary.flight import Flight as FlightRecord
@@ -60,7 +61,7 @@ class Flying:
         phases = ("formed", "moving", "holding") if phase == "formed" else (phase,)
         wanted = ids or tuple(self.fleet.ids)
 
-        def enough(said: dict[int, dict[str, Any]]) -> bool:
+        def enough(said: dict[int, Status]) -> bool:
             assert self.up.popen.poll() is None, self.up.err
             return all(i in said and said[i].phase in phases for i in wanted)
 
@@ -79,7 +80,7 @@ class Flying:
     def truth(self, vehicle_id: int) -> npt.NDArray[Any]:
         """What a vehicle has truly done so far; its modes are CURRENT_MODE's at 20 Hz."""
         rows = np.fromfile(self.folder / "truth.bin", TRUTH_DTYPE)
-        mine = rows[rows["vehicle_id"] == vehicle_id]
+        mine: npt.NDArray[Any] = rows[rows["vehicle_id"] == vehicle_id]
         return mine[np.argsort(mine["time_unix_ns"], kind="stable")]
 
     def left_offboard_ns(self, vehicle_id: int, after_ns: int) -> tuple[int, int]:

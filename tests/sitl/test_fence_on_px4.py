@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from fleet_process import Fleet, eventually, operator_of, run, started, truth, wait_status
+from fleet_process import Fleet, all_in, eventually, operator_of, run, started, truth, wait_status
 from px4_fleet import PATIENCE_S, flying, sitl_fleet
 
 from companion.core.safety.filter import COLLISION_DISTANCE_M
 from companion.operator.client import Operator, PreflightError
 
 RADIUS_M, MARGIN_M = 30.0, 2.0
-FENCE = {"radius_m": RADIUS_M, "margin_m": MARGIN_M, "floor_m": 2.0, "ceiling_m": 8.0}
+FENCE: dict[str, Any] = {"radius_m": RADIUS_M, "margin_m": MARGIN_M, "floor_m": 2.0, "ceiling_m": 8.0}
 BEYOND_M = 1.5
 """beyond the margin at most, half a metre inside the edge: the stubs' bound"""
 SPEED_MAX_M_S = 4.0
@@ -73,7 +73,7 @@ def broken(fleet: Fleet, build: Path) -> Iterator[tuple[subprocess.Popen[bytes],
                     return False
 
             assert eventually(taken_off, PATIENCE_S)
-            wait_status(operator, lambda said: said.get(1, {}).get("phase") in IN_THE_AIR, PATIENCE_S)
+            wait_status(operator, all_in([1], *IN_THE_AIR), PATIENCE_S)
             yield companion, operator
             operator.land()
             assert eventually(lambda: not truth(fleet.folder / "truth.bin", 1)["armed"][-1], 60.0)
@@ -91,7 +91,7 @@ def test_a_broken_law_at_the_speed_limit_stays_inside_on_px4_and_without_the_fen
     tmp_path: Path, build: Path, record_property: Property, fence: bool
 ) -> None:
     plan = {"automatic": False, "then": "stay", "legs": []}
-    fleet = sitl_fleet(tmp_path, 1, plan=plan, **({"fence": FENCE} if fence else {}))
+    fleet = sitl_fleet(tmp_path, 1, **({"plan": plan, "fence": FENCE} if fence else {"plan": plan}))
     assert fleet.config.limits.speed_max_m_s == SPEED_MAX_M_S
     with broken(fleet, build) as (companion, operator):
         companion.send_signal(signal.SIGUSR1)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from fleet_process import child, children, eventually, gone, run
-from px4_fleet import flying, sitl_fleet
+from px4_fleet import PATIENCE_S, flying, sitl_fleet
 
 from companion.core.frames import Ned, ned_to_geodetic
 from companion.io.recorder import read_recording
@@ -131,8 +131,8 @@ def test_no_instance_is_left_when_their_host_is_killed(tmp_path: Path, build: Pa
     with flying(sitl_fleet(tmp_path, 1, plan=FOR_EVER), build) as flight:
         flight.wait("idle")
         host = child(flight.up.popen.pid, "sim sitl")
+        assert eventually(lambda: len(children(host)) == 1, PATIENCE_S)
         pids = list(children(host).values())
-        assert len(pids) == 1
         os.kill(host, signal.SIGKILL)
         assert eventually(lambda: all(gone(p) for p in pids), 15.0)
         assert flight.up.wait(60.0) == 1

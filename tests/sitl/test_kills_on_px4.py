@@ -69,7 +69,7 @@ def test_a_px4_that_dies_in_flight_is_told_on_the_screen_and_in_the_summary_and_
         for i in (1, 3):
             status = said[i]
             assert status is not None
-            assert status["phase"] in ("formed", "moving", "holding")
+            assert status.phase in ("formed", "moving", "holding")
         flight.up.signal(signal.SIGINT)
         assert eventually(lambda: not any(flight.truth(i)["armed"][-1] for i in (1, 3)), 60.0)
         landed_s = time.monotonic()
