@@ -43,7 +43,15 @@ FLIGHTS = (
     "test_fence.py::test_a_climb_for_ever", "test_fence.py::test_a_vehicle_blown_out",
 )  # fmt: skip
 """left out: they are three quarters of the tests' time, and what they show of a mutant the others must show exactly"""
-PYTEST_ARGUMENTS = ["-p", "no:randomly", "-p", "no:cacheprovider", *(f"--deselect=tests/unit/{x}" for x in FLIGHTS)]
+PYTEST_ARGUMENTS = [
+    "-p",
+    "no:randomly",
+    "-p",
+    "no:cacheprovider",
+    "-m",
+    "not long",
+    *(f"--deselect=tests/unit/{x}" for x in FLIGHTS),
+]
 CONFIGURATION = {
     "tool": {
         "mutmut": {
@@ -55,7 +63,7 @@ CONFIGURATION = {
             "timeout_multiplier": 100.0,
             "use_git_change_detection": False,
         },
-        "pytest": {"ini_options": {"addopts": "-q", "timeout": 180}},
+        "pytest": {"ini_options": {"addopts": "-q", "timeout": 180, "markers": ["long"]}},
     }
 }
 CONFTEST = """
