@@ -218,6 +218,7 @@ class Rig:
         began_s = time.monotonic()
         ip("-n", f"{TAG}-air", "link", "set", f"v{i}", "down")
         time.sleep(wait_s)
+        ip("-n", f"{TAG}-air", "link", "set", f"v{i}", "up")
         noticed = []
         for other, seen in self.present.items():
             if other != i:

@@ -221,6 +221,7 @@ def test_three_companions_in_one_process_fly_on_the_transport_in_memory(tmp_path
         assert operator.take_off().all_accepted
         said = wait_status(operator, all_in(fleet.ids, *SETTLED))
         assert all(s.neighbours == 2 and (s.nearest_m or 0.0) > 1.0 for s in said.values())
+        assert all((s.packets_hz or 0.0) > 0.0 and (s.bytes_per_s or 0.0) > 0.0 for s in said.values())
         assert operator.land().all_accepted
         wait_status(operator, all_in(fleet.ids, "landed"))
     assert statuses == dict.fromkeys(fleet.ids, 0)
