@@ -44,6 +44,8 @@ KEEP_ALIVES = {"laptop": 4, "field": 2}
 """so many keep-alives a session sends in `peers.notice_lost_s` to a peer to which it sends nothing else. On a laptop
 that is one a second: they are most of an idle mesh's CPU (30 processes on two cores: 31 % of one core in all, 74 % with
 four a second). In the field each is a packet, and TCP repeats the one that is lost"""
+PROCESS_END_S = 1.5
+"""on a laptop processes end and no computer does: that is told within so long"""
 T_MAX_S = 10.0
 SILENCES = 5.0
 """default of `trigger.t_max_s`: so many times `peers.notice_lost_s`, and T_MAX_S at most"""
@@ -253,8 +255,8 @@ class FleetConfig(FleetTables):
             stale_after_s=STALE_AFTER * self.trigger.t_max_s,
             heartbeat_s=self.trigger.t_max_s,
             isolated_flight_s=self.peers.isolated_flight_s,
-            notice_lost_s=self.notice_lost_s,
-            notice_spread_s=self.keep_alive_s,
+            notice_lost_s=self.notice_lost_s if self.peers.network == "field" else PROCESS_END_S,
+            notice_spread_s=self.keep_alive_s if self.peers.network == "field" else 0.0,
             uncertainty_m=self.prediction_error_m,
             motion=self.peer_motion,
             digest_size=self.peers.digest,
