@@ -67,6 +67,11 @@ def _table_faults(config: FleetConfig) -> Iterator[str]:
             values.append(("zenoh", v.zenoh))
             if not is_zenoh_endpoint(v.zenoh):
                 yield f"$.vehicle[{k}].zenoh must be PROTOCOL/HOST:PORT with tcp, udp, tls or quic, got {v.zenoh!r}"
+        if config.peers.network == "field" and v.enabled and (v.zenoh is None or v.zenoh.startswith("udp/")):
+            yield (
+                f'$.vehicle[{k}].zenoh must be tcp/HOST:PORT with $.peers.network = "field" (by UDP a pair that loses '
+                f"a declaration stays deaf), got {v.zenoh or 'nothing'}: name the address at which the others reach it"
+            )
         if v.slot != "auto":
             values.append(("slot", v.slot))
             if v.enabled and v.slot >= len(config.vehicles):

@@ -37,8 +37,34 @@ SPACING_MARGIN_M = 0.2
 """slots stay this much farther apart than separation and barrier begin to act"""
 STALE_AFTER = 2.1
 """a peer is stale after this many T_max without a word: one message may be lost"""
+NOTICE_LOST_S = {"laptop": 4.0, "field": 2.0}
+"""default of `peers.notice_lost_s` by `peers.network`: the field's is shorter since a computer that loses its power
+closes no connection, a laptop's longer since an overloaded one holds its processes up"""
+KEEP_ALIVES = {"laptop": 4, "field": 2}
+"""so many keep-alives a session sends in `peers.notice_lost_s` to a peer to which it sends nothing else. On a laptop
+that is one a second: they are most of an idle mesh's CPU (30 processes on two cores: 31 % of one core in all, 74 % with
+four a second). In the field each is a packet, and TCP repeats the one that is lost"""
+PROCESS_END_S = 1.5
+"""on a laptop processes end and no computer does: that is told within so long"""
+T_MAX_S = 10.0
+SILENCES = 5.0
+"""default of `trigger.t_max_s`: so many times `peers.notice_lost_s`, and T_MAX_S at most"""
 EXCHANGE_DELAY_S = 0.05
 """delay to a peer, as the error bound takes it beside t_min and the control period"""
+
+
+def notice_lost_s(network: str, value: float | None) -> float:
+    """`peers.notice_lost_s`, or its default on that network (s)."""
+    return NOTICE_LOST_S[network] if value is None else value
+
+
+def t_max_default_s(notice_s: float) -> float:
+    """`trigger.t_max_s` where the file leaves it out (s).
+
+    No message need be a keep-alive: a state costs five times a keep-alive's bytes, and each that is sent takes one's
+    place on its link anyway. So the longest silence is several times `notice_s`, short only where that is short.
+    """
+    return min(T_MAX_S, SILENCES * notice_s)
 
 
 class Vehicle(Table):
@@ -122,6 +148,16 @@ class FleetConfig(FleetTables):
     def near_rate(self) -> PeriodicTrigger:
         """When vehicles speak that are near each other."""
         return PeriodicTrigger(self.trigger.near_period_s)
+
+    @property
+    def notice_lost_s(self) -> float:
+        """Within this time a peer is noticed to be gone (s): the lease of the sessions."""
+        return notice_lost_s(self.peers.network, self.peers.notice_lost_s)
+
+    @property
+    def keep_alive_s(self) -> float:
+        """How long a session says nothing to a peer before it sends a keep-alive (s)."""
+        return self.notice_lost_s / KEEP_ALIVES[self.peers.network]
 
     @cached_property
     def prediction_error_m(self) -> float:
@@ -219,6 +255,8 @@ class FleetConfig(FleetTables):
             stale_after_s=STALE_AFTER * self.trigger.t_max_s,
             heartbeat_s=self.trigger.t_max_s,
             isolated_flight_s=self.peers.isolated_flight_s,
+            notice_lost_s=self.notice_lost_s if self.peers.network == "field" else PROCESS_END_S,
+            notice_spread_s=self.keep_alive_s if self.peers.network == "field" else 0.0,
             uncertainty_m=self.prediction_error_m,
             motion=self.peer_motion,
             digest_size=self.peers.digest,

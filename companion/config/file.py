@@ -9,8 +9,9 @@ from typing import Any
 from pydantic import ValidationError
 
 from companion.config.checks import faults
-from companion.config.derived import FleetConfig
+from companion.config.derived import FleetConfig, t_max_default_s
 from companion.config.messages import sentence
+from companion.config.schema import NOTICE_LEAST_S, NOTICE_MOST_S
 from companion.errors import ConfigError
 
 
@@ -52,10 +53,21 @@ def _tables(text: str, path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path}: is not valid TOML: {error}") from error
 
 
+def with_message_period(tables: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The tables with `trigger.t_max_s` as it follows from `peers.notice_lost_s` where they leave it out."""
+    peers, trigger = tables.get("peers", {}), tables.get("trigger", {})
+    notice_s = peers.get("notice_lost_s") if isinstance(peers, Mapping) else None
+    if not isinstance(trigger, Mapping) or "t_max_s" in trigger or not isinstance(notice_s, int | float):
+        return tables
+    if not NOTICE_LEAST_S <= notice_s <= NOTICE_MOST_S:
+        return tables  # the validation says so
+    return {**tables, "trigger": {**trigger, "t_max_s": t_max_default_s(notice_s)}}
+
+
 def parse(tables: Mapping[str, Any], name: str) -> FleetConfig:
     """Validate raw tables; `name` is the file's, for messages."""
     try:
-        config = FleetConfig.model_validate_json(json.dumps(tables, default=str))
+        config = FleetConfig.model_validate_json(json.dumps(with_message_period(tables), default=str))
     except ValidationError as error:
         found = list(dict.fromkeys(sentence(e, tables) for e in error.errors()))
         raise ConfigError("\n".join(f"{name}: {fault}" for fault in found)) from error

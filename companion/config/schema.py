@@ -133,6 +133,10 @@ class FenceTable(Table):
     """and this far from floor and ceiling"""
 
 
+NOTICE_LEAST_S, NOTICE_MOST_S = 1.0, 10.0
+"""of `peers.notice_lost_s`"""
+
+
 class PeersTable(Table):
     """Exchange between the vehicles."""
 
@@ -146,6 +150,10 @@ class PeersTable(Table):
     isolated_flight_s: Wait = 5.0
     """how long a vehicle that hears nobody flies on before it holds"""
     network: Literal["laptop", "field"] = "laptop"
+    notice_lost_s: Annotated[float, Field(ge=NOTICE_LEAST_S, le=NOTICE_MOST_S, allow_inf_nan=False)] | None = None
+    """a peer whose computer or radio is gone is noticed within this time: the sessions' lease and keep-alives follow,
+    and `trigger.t_max_s` where it is left out; None: 4 on a laptop, 2 in the field. Shorter, one stalled segment would
+    be taken for a lost peer; longer, the others fly into the place where it has stopped"""
     scouting_port: Annotated[int, Field(ge=1024, le=65535)] | None = None
     """multicast port by which a laptop's vehicles find each other; None: from the fleet's name"""
 

@@ -175,7 +175,8 @@ FAILSAFES: dict[Failsafe, Row] = {
     Failsafe.ALONE_FOR_LONG: Row("`failsafe.isolated_hold_s` of that hold", None, Action.LAND, "", _NOT),
     Failsafe.DETACHED_FOR_LONG: Row("`peers.wait_s` apart", None, Action.LAND, "no plan was told, say", _NOT),
     Failsafe.PEER_GONE: Row(
-        "milliseconds when the process ends, the lease (4 s) when its machine or radio does", None, Action.CONTINUE,
+        "milliseconds when the process ends, `peers.notice_lost_s` when its computer or radio does", None,
+        Action.CONTINUE,
         "all the distance is kept to everywhere it may be: flown on with the plan, or stopped", "it is heard again",
         by=NoticedBy.PEER_TABLE,
     ),

@@ -12,6 +12,7 @@ import secrets
 import select
 import socket
 import time
+from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
@@ -29,7 +30,7 @@ from companion.io.network import peer_transport
 from companion.io.recorder import Recorder
 from companion.io.records import TickRecord, TrafficRecord, peer_body
 from companion.io.systemd import Notifier
-from companion.io.transport import Connect, PresenceChange, ReceivedSample, Request
+from companion.io.transport import Connect, PresenceChange, ReceivedSample, Request, Sent
 from companion.vehicle.agent import Agent
 from companion.vehicle.guard import Guard
 from companion.vehicle.outputs import Outputs
@@ -42,6 +43,9 @@ LANDING_GRACE_S = 3.0
 """how long an ending companion waits for its autopilot to confirm landing"""
 ABANDONED_GRACE_S = 1.0
 """the same when whoever launched it is gone"""
+
+TRAFFIC_SECONDS = 10
+"""over so many seconds the status tells packets a second: heartbeats come that far apart"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +86,8 @@ class Companion:
         self._launcher_fd = settings.stop_fd
         self._last_ns = 0
         self._second_ns = 0
+        self._sent: deque[tuple[int, Sent]] = deque([(time.monotonic_ns(), Sent(0, 0))], TRAFFIC_SECONDS + 1)
+        """when (monotonic ns) the network had sent how much, each second"""
         self._driver_ns: int | None = None
         """when the position that the next tick follows from was received"""
         self._file = self._configuration()
@@ -295,7 +301,9 @@ class Companion:
             self._file_due_ns = now_ns + round(CONFIGURATION_S * 1e9)
             if self._configuration() != self._file:
                 self._notice(Failsafe.CONFIGURATION, now_ns)
-        self._record("traffic", self._instant(now_ns), TrafficRecord(self.network.bytes_sent()).pack())
+        sent = self.network.sent()
+        self._sent.append((now_ns, sent))
+        self._record("traffic", self._instant(now_ns), TrafficRecord(*sent).pack())
 
     def _notice(self, failsafe: Failsafe, now_ns: int) -> None:
         """Tell the agent, once, what only the process can see."""
@@ -322,11 +330,15 @@ class Companion:
             "operator: could not be answered": counters.reply_failures,
         }
         rejected = {kind: count for kind, count in elsewhere.items() if count}
+        (then_ns, then), (now_ns, sent) = self._sent[0], self._sent[-1]
+        seconds = (now_ns - then_ns) * 1e-9
         rejected |= {f"raised: {kind}": count for kind, count in self.guard.raised.items()}
         return replace(
             status,
             rejected=status.rejected | rejected,
             lateness_ms=self.lateness_ns * 1e-6,
             dropped=counters.dropped,
+            packets_hz=(sent.packets - then.packets) / seconds if seconds else None,
+            bytes_per_s=(sent.bytes - then.bytes) / seconds if seconds else None,
             recorder_lost=0 if self.recorder is None else self.recorder.lost,
         )

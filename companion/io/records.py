@@ -4,7 +4,7 @@ import struct
 from typing import NamedTuple, Self
 
 TICK = struct.Struct("<qqqff?6f")
-TRAFFIC = struct.Struct("<q")
+TRAFFIC = struct.Struct("<qq")
 
 
 class TickRecord(NamedTuple):
@@ -41,8 +41,10 @@ class TickRecord(NamedTuple):
 class TrafficRecord(NamedTuple):
     """Body of the "traffic" channel, each second."""
 
-    bytes_sent: int
+    packets_sent: int
     """by this companion's network connections so far"""
+    bytes_sent: int
+    """the same, headers included"""
 
     def pack(self) -> bytes:
         """As recorded."""

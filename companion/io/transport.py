@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Final, Protocol, Self
+from typing import Final, NamedTuple, Protocol, Self
 
 from companion.errors import CompanionError
 
@@ -69,6 +69,14 @@ class Request:
 Event = ReceivedSample | PresenceChange | Request
 
 
+class Sent(NamedTuple):
+    """What was put on the wire."""
+
+    packets: int
+    bytes: int
+    """headers included"""
+
+
 @dataclass(slots=True)
 class TransportCounters:
     """What went wrong so far, as counts."""
@@ -104,8 +112,8 @@ class PeerTransport(Protocol):
     def counters(self) -> TransportCounters:
         """A copy of the counts so far."""
 
-    def bytes_sent(self) -> int:
-        """Bytes put on the wire so far, headers included; 0 where there is no wire."""
+    def sent(self) -> Sent:
+        """What this end has put on the wire so far; none where there is no wire."""
 
     def close(self) -> None:
         """Leave the fleet: the others see this vehicle vanish. May be called again."""

@@ -46,6 +46,7 @@ COLUMNS = (
     _Column("neigh-\nbours", 6, 6, lambda s, _: _number(s.neighbours, 0)),
     _Column("nearest\nm", 7, 2, lambda s, _: _number(s.nearest_m, 2)),
     _Column("messages\n/s", 8, 5, lambda _, rate: _number(rate, 2)),
+    _Column("packets\n/s", 7, 9, lambda s, _: _number(s.packets_hz, 1)),
     _Column("oldest\ns", 6, 3, lambda s, _: _number(s.oldest_age_s, 1)),
     _Column("late\nms", 6, 4, lambda s, _: _number(s.lateness_ms, 1)),
     _Column("battery\n%", 7, 7, lambda s, _: _number(s.battery_percent, 0, least=0)),

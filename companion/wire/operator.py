@@ -150,6 +150,10 @@ class Status:
     """messages of peers for which its process had no room"""
     recorder_lost: _Count = 0
     """entries missing in its recording"""
+    packets_hz: _Number | None = None
+    """packets that its network connections send a second, over the last ten; None: nobody counts them"""
+    bytes_per_s: _Number | None = None
+    """the same in bytes, headers included"""
 
 
 @dataclass(frozen=True, slots=True)

@@ -89,6 +89,11 @@ def show_summary(summary: Mapping[str, Any]) -> None:
         ("messages a vehicle", _unit(steady["messages_per_vehicle_hz"], "/s")),
         ("fewer than at 20 Hz", _unit(steady["reduction_vs_20hz_percent"], "%")),
         (
+            "packets a vehicle",
+            f"{_unit(steady['packets_per_vehicle_hz'], '/s')} ({steady['network']} network), "
+            f"{_unit(steady['packets_reduction_vs_20hz_percent'], '%')} fewer than at 20 Hz at least",
+        ),
+        (
             "payload, wire a vehicle",
             f"{steady['payload_bytes_per_vehicle_s']}, {steady['wire_bytes_per_vehicle_s']} B/s",
         ),

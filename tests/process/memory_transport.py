@@ -10,7 +10,7 @@ from queue import Empty, SimpleQueue
 from typing import Self
 
 from companion.io.inbox import Inbox
-from companion.io.transport import TOPICS, Event, Request, TransportCounters
+from companion.io.transport import TOPICS, Event, Request, Sent, TransportCounters
 
 
 @dataclass
@@ -29,7 +29,7 @@ class MemoryTransport:
         self.id = vehicle_id
         self.inbox = Inbox(vehicle_id, wake)
         self._bus = bus
-        self._sent = 0
+        self._sent = Sent(0, 0)
 
     def open(self) -> None:
         now_ns = time.monotonic_ns()
@@ -52,7 +52,7 @@ class MemoryTransport:
             self._bus.last[key] = self, payload
             for other in self._bus.vehicles:
                 if other is not self:
-                    self._sent += len(payload)
+                    self._sent = Sent(self._sent.packets + 1, self._sent.bytes + len(payload))
                     other.inbox.put_sample(key, payload, now_ns)
 
     def drain(self) -> list[Event]:
@@ -62,7 +62,7 @@ class MemoryTransport:
     def counters(self) -> TransportCounters:
         return self.inbox.counters
 
-    def bytes_sent(self) -> int:
+    def sent(self) -> Sent:
         return self._sent
 
     def close(self) -> None:

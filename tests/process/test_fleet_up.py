@@ -247,6 +247,7 @@ def test_the_summary_has_every_promised_figure(flown: Flown) -> None:
         "vehicles", "formed_after_s", "minimum_distance_m", "steady.formation_error_rms_m",
         "steady.velocity_error_rms_m_s", "steady.messages_per_vehicle_hz", "steady.reduction_vs_20hz_percent",
         "steady.centroid_error_rms_m", "steady.payload_bytes_per_vehicle_s", "steady.wire_bytes_per_vehicle_s",
+        "steady.packets_per_vehicle_hz", "steady.packets_reduction_vs_20hz_percent",
         "loop_lateness_ms.p50", "loop_lateness_ms.p99", "latency_ms.p50", "latency_ms.p99", "reference_lateness_ms.p99",
         "setpoint_gap_max_s", "seed",
     )  # fmt: skip

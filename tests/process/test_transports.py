@@ -120,7 +120,8 @@ def test_what_a_vehicle_publishes_reaches_its_peers_once_in_order_and_not_itself
         assert one.until(lambda: bool(one.samples))
         assert one.samples == [("fleet/2/state", b"back")]
         assert one.transport.counters.dropped == one.transport.counters.malformed == 0
-        assert one.transport.bytes_sent() > 0
+        sent = one.transport.sent()
+        assert 0 < sent.packets < sent.bytes
 
 
 def test_a_late_joiner_gets_the_last_state_and_plan_of_who_is_there(network: Network) -> None:
@@ -224,6 +225,7 @@ def test_three_companions_in_one_process_fly_on_the_transport_in_memory(tmp_path
         flying[1].network.inbox.count("reply_failures")  # type: ignore[attr-defined]
         told = wait_status(operator, lambda said: "peer: could not be sent" in said[1].rejected)[1].rejected
         assert (told["peer: could not be sent"], told["operator: could not be answered"]) == (1, 1)
+        assert all((s.packets_hz or 0.0) > 0.0 and (s.bytes_per_s or 0.0) > 0.0 for s in said.values())
         assert operator.land().all_accepted
         wait_status(operator, all_in(fleet.ids, "landed"))
     assert statuses == dict.fromkeys(fleet.ids, 0)

@@ -40,9 +40,9 @@ PATIENCE_S = 10.0
 _numbers = itertools.count()
 
 
-def mesh_endpoints(host: str, port: int = 7447) -> tuple[str, str]:
-    """The pair of endpoints of one vehicle in the field: reliable traffic over TCP, best effort over UDP."""
-    return f"tcp/{host}:{port}?rel=1", f"udp/{host}:{port}?rel=0"
+def mesh_endpoints(host: str, port: int = 7447) -> tuple[str]:
+    """The endpoint of one vehicle in the field."""
+    return (f"tcp/{host}:{port}",)
 
 
 @pytest.fixture
@@ -223,8 +223,8 @@ def test_the_field_listens_where_told_retries_forever_and_never_multicasts() -> 
     settings = SessionSettings(
         "starling", 3, profile="field", listen=mesh_endpoints("10.0.0.3"), connect=mesh_endpoints("10.0.0.4")
     )
-    assert read(settings, "listen/endpoints") == ["tcp/10.0.0.3:7447?rel=1", "udp/10.0.0.3:7447?rel=0"]
-    assert read(settings, "connect/endpoints") == ["tcp/10.0.0.4:7447?rel=1", "udp/10.0.0.4:7447?rel=0"]
+    assert read(settings, "listen/endpoints") == ["tcp/10.0.0.3:7447"]
+    assert read(settings, "connect/endpoints") == ["tcp/10.0.0.4:7447"]
     assert read(settings, "connect/timeout_ms") == -1
     assert read(settings, "connect/exit_on_failure") is False
     assert read(settings, "connect/retry") == {
@@ -233,12 +233,12 @@ def test_the_field_listens_where_told_retries_forever_and_never_multicasts() -> 
         "period_increase_factor": 1.5,
     }
     assert read(settings, "scouting/multicast/enabled") is False
-    assert read(settings, "scouting/gossip/enabled") is True
-    assert read(settings, "transport/unicast/max_links") == 2
+    assert read(settings, "scouting/gossip/enabled") is False
+    assert read(settings, "transport/unicast/max_links") == 1
     assert read(settings, "transport/unicast/open_timeout") == 1000
     assert read(settings, "transport/unicast/accept_timeout") == 1000
     assert read(settings, "transport/link/tx/lease") == 2000
-    assert read(settings, "transport/link/tx/keep_alive") == 8
+    assert read(settings, "transport/link/tx/keep_alive") == 2
 
 
 # Vehicles among themselves

@@ -168,6 +168,10 @@ RANGES = [
     ("peers.digest", 31, "a whole number >= 0 and <= 30"),
     ("peers.digest", 2.0, "a whole number >= 0 and <= 30"),
     ("peers.network", "mesh", "'laptop' or 'field'"),
+    ("peers.notice_lost_s", 0.9, "a finite number >= 1 and <= 10 s"),
+    ("peers.notice_lost_s", 10.1, "a finite number >= 1 and <= 10 s"),
+    ("peers.notice_lost_s", NAN, "a finite number >= 1 and <= 10 s"),
+    ("peers.notice_lost_s", "soon", "a finite number >= 1 and <= 10 s"),
     ("peers.scouting_port", 80, "a whole number >= 1024 and <= 65535"),
     ("preflight.battery_min_percent", 101, "a finite number >= 0 and <= 100 %"),
     ("preflight.battery_min_percent", -1, "a finite number >= 0 and <= 100 %"),
@@ -328,6 +332,15 @@ def polygon(*corners: list[int]) -> Change:
     return fence(polygon_m=list(corners))
 
 
+def in_the_field(first: str) -> Change:
+    def change(tables: Tables) -> None:
+        tables["peers"]["network"] = "field"
+        for k, v in enumerate(tables["vehicle"]):
+            v["zenoh"] = f"tcp/10.0.0.{k + 1}:7447" if k else first
+
+    return change
+
+
 ACROSS = [
     (put("formation.spacing_m", 1.5), "$.formation.spacing_m", "the safety radius 1.49 m", "got 1.50 m"),
     (put("law.r0_m", 5.0), "$.formation.spacing_m", "separation's range 5.00 m", "got 4.00 m"),
@@ -341,6 +354,10 @@ ACROSS = [
     (drop("vehicle.0.id"), "$.vehicle[0].id", "is required", ""),
     (put("vehicle", []), "$.vehicle", "at least 1", "got 0"),
     (nobody, "$.vehicle", "at least one vehicle must be enabled", ""),
+    (put("peers.network", "field"), "$.vehicle[0].zenoh", 'tcp/HOST:PORT with $.peers.network = "field"',
+     "got nothing: name the address"),
+    (in_the_field("udp/10.0.0.1:7447"), "$.vehicle[0].zenoh", "by UDP a pair that loses a declaration stays deaf",
+     "got udp/10.0.0.1:7447: name the address"),
     (put("vehicle.0.slot", 10), "$.vehicle[0].slot", "below the 10 enabled vehicles", "got 10"),
     (put("launch.spacing_m", 1.0), "$.launch.spacing_m", "at least the safety radius 1.49 m", "got 1.00 m"),
     (put("vehicle.0.pad_m", [-2.0, -7.5]), "$.vehicle[].pad_m", "at least the safety radius", "got"),
@@ -393,6 +410,23 @@ def test_values_that_do_not_go_together_are_refused(change: Change, where: str, 
     assert where in text
     assert allowed in text
     assert came in text
+
+
+@pytest.mark.parametrize(
+    ("changes", "notice_s", "t_max_s"),
+    [
+        ((), 4.0, 10.0), ((in_the_field("tcp/10.0.0.1:7447"),), 2.0, 10.0),
+        ((put("peers.notice_lost_s", 10),), 10.0, 10.0), ((put("peers.notice_lost_s", 1.0),), 1.0, 5.0),
+        ((put("peers.notice_lost_s", 1.5), put("trigger.t_max_s", 9.0)), 1.5, 9.0),
+    ],
+)  # fmt: skip
+def test_the_longest_silence_follows_from_how_soon_a_lost_peer_is_to_be_noticed(
+    changes: tuple[Change, ...], notice_s: float, t_max_s: float
+) -> None:
+    config = parse(changed(*changes), "fleet.toml")
+    assert (config.notice_lost_s, config.trigger.t_max_s) == (notice_s, t_max_s)
+    assert config.peer_limits.notice_lost_s == (notice_s if config.peers.network == "field" else 1.5)
+    assert config.peer_limits.heartbeat_s == config.peer_motion.t_max_s == t_max_s
 
 
 def test_the_fence_of_the_file_is_what_the_safety_filter_keeps() -> None:

@@ -15,7 +15,6 @@ from companion.core.neighbours.gates import GATE_RESIDUAL_M, GATE_VELOCITY_M_S, 
 from companion.core.neighbours.sample import PeerLimits, predict_sample
 from companion.core.neighbours.table import (
     FUTURE_LIMIT_S,
-    PRESENCE_DELAY_S,
     UNCERTAINTY_GROWTH_M_S,
     UNCERTAINTY_GROWTH_MAX_M,
     PeerTable,
@@ -39,6 +38,7 @@ MOTION = PeerMotion(
 )  # fmt: skip
 LIMITS = PeerLimits(
     hold="damped", hold_damping_s=0.7, range_m=100.0, stale_after_s=12.0, heartbeat_s=5.7, isolated_flight_s=5.0,
+    notice_lost_s=1.5, notice_spread_s=0.5,
     uncertainty_m=0.4, motion=MOTION, digest_size=3,
 )  # fmt: skip
 OWN = 1
@@ -569,7 +569,7 @@ def test_a_peer_whose_presence_ended_flew_on_until_shortly_before() -> None:
     t.accept(message(sample(t, 2, 0.0)), at(0.0))
     t.presence(2, False, at(6.0))
     n = predicted(t, 8.0)[2]
-    stopped = t.history.reference(2, ns(6.0 - PRESENCE_DELAY_S)).position_ned_m
+    stopped = t.history.reference(2, ns(6.0 - LIMITS.notice_lost_s)).position_ned_m
     assert n.last_seen_ned_m == pytest.approx(stopped)
     assert n.position_ned_m == pytest.approx(t.history.reference(2, ns(8.0)).position_ned_m)
     assert not n.shares_avoidance
@@ -583,12 +583,12 @@ def test_a_peer_heard_just_before_its_end_did_not_stop_before_that() -> None:
     assert predicted(t, 6.0)[2].last_seen_ned_m == pytest.approx(s.position_ned_m)
 
 
-def test_a_lost_peer_flies_on_no_longer_than_it_would_alone() -> None:
+def test_a_lost_peer_flies_on_no_longer_than_it_would_alone_and_notices_it_later() -> None:
     t = table()
     t.accept(message(sample(t, 2, 0.0)), at(0.0))
     t.presence(2, False, at(1.0))
-    last = t.history.reference(2, ns(1.0 + LIMITS.isolated_flight_s)).position_ned_m
-    for seconds in (6.0, 7.0, 60.0):
+    last = t.history.reference(2, ns(1.0 + LIMITS.notice_spread_s + LIMITS.isolated_flight_s)).position_ned_m
+    for seconds in (6.5, 7.5, 60.0):
         n = predicted(t, seconds)[2]
         assert n.position_ned_m == pytest.approx(last)
         assert n.velocity_ned_m_s == ZERO

@@ -57,7 +57,7 @@ def test_every_vehicle_has_its_phase_and_error_on_a_line_at_any_width_and_with_a
 def test_a_wider_terminal_shows_no_less_and_the_widest_shows_all() -> None:
     columns = [len(shown({1: status()}, width)[2].split()) for width in WIDTHS]
     assert all(a <= b for a, b in itertools.pairwise(columns))
-    assert columns[-1] == 10
+    assert columns[-1] == 11
 
 
 @pytest.mark.parametrize("width", [40, 76, 80, 100, 130, 200])
@@ -112,7 +112,7 @@ def test_the_summary_shows_who_commanded_what_and_who_was_killed(capsys: pytest.
         (
             "formation_error_rms_m", "seconds", "velocity_error_rms_m_s", "centroid_error_rms_m",
             "messages_per_vehicle_hz", "reduction_vs_20hz_percent", "payload_bytes_per_vehicle_s",
-            "wire_bytes_per_vehicle_s",
+            "packets_per_vehicle_hz", "packets_reduction_vs_20hz_percent", "wire_bytes_per_vehicle_s", "network",
         ),
         1.0,
     )  # fmt: skip

@@ -22,11 +22,12 @@ _NOWHERE = Reference(ZERO, ZERO, ZERO, 0.0)
 def possible_path(track: Track, fleet_ns: int, foresight: Foresight) -> tuple[list[Ned], Ned]:
     """Where a lost peer may be, from where it may have stopped to where it is if it flew on, and how fast.
 
-    One whose presence ended was seen alive until shortly before, so it stopped no earlier than PRESENCE_DELAY_S
+    One whose presence ended was seen alive until shortly before, so it stopped no earlier than `notice_lost_s`
     before that; one that fell silent by itself may have stopped at any time since its last sample (`silence` says
     what holds when all fall silent at once). A vehicle that hears nobody holds by itself after `isolated_flight_s`,
-    so it flew on no longer than that. One that was armed, climbed or landed is somewhere in the column between
-    there and its altitude, or the ground; so is one in whose flight a companion started.
+    and notices that no more than `notice_spread_s` later, so it flew on no longer than that. One that was armed,
+    climbed or landed is somewhere in the column between there and its altitude, or the ground; so is one in whose
+    flight a companion started.
     """
     sample = track.sample
     last = sample.position_ned_m

@@ -30,6 +30,10 @@ class PeerLimits:
     """T_max: every peer speaks at least so often"""
     isolated_flight_s: float
     """how long a vehicle that hears nobody flies on before it holds by itself"""
+    notice_lost_s: float
+    """how long after a peer's end its presence may still be reported"""
+    notice_spread_s: float
+    """of two that lose each other, one may notice so much later than the other"""
     uncertainty_m: float
     """bound on the prediction's error of a peer that is heard"""
     motion: PeerMotion

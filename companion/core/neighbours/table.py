@@ -34,8 +34,6 @@ from companion.core.vectors import closest_point_parameter, lerp
 
 FUTURE_LIMIT_S = 1.0
 """a sample from further ahead than this comes from a clock that is wrong"""
-PRESENCE_DELAY_S = 1.5
-"""how long after a peer's end its presence may still be reported"""
 LATE_S = 2.0
 """a sample older than what is known is looked at only if it is younger than this; else it is taken for a repeat"""
 HEARSAY_M = 2.0
@@ -219,10 +217,11 @@ class PeerTable:
             return
         peer.present = alive
         if not alive:
-            flown_ns = now.fleet_ns + round(self.limits.isolated_flight_s * 1e9)
+            stopped_ns = now.fleet_ns - round(self.limits.notice_lost_s * 1e9)
+            flown_ns = now.fleet_ns + round((self.limits.notice_spread_s + self.limits.isolated_flight_s) * 1e9)
             for track in peer.tracks:
                 if track.lost_at_ns is None:
-                    track.lose(now.fleet_ns, now.fleet_ns - round(PRESENCE_DELAY_S * 1e9), flown_ns, silent=False)
+                    track.lose(now.fleet_ns, stopped_ns, flown_ns, silent=False)
         self._deaf_from_ns = silence.reckon(self._peers.values(), self.limits)
 
     def deaf(self, now: Instant) -> bool:

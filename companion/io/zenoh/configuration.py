@@ -3,6 +3,15 @@
 All keys are below a namespace, the fleet's name: fleets of different names on one network do not hear each other.
 Sessions are peers, also the operator's: peers do not relay, so a client would hear the one vehicle that it is connected
 to.
+
+Of each pair one end connects: in the field the vehicle with the larger id, an operator to all; on a laptop both find
+each other by scouting, and the second connection is refused. That connection is TCP and carries all, states too:
+they come in order behind whatever segment is repeated. UDP alone loses declarations, which nobody repeats, and its pair
+stays deaf; a UDP link beside TCP is the same after a stall as long as the lease, for one end then joins the other's old
+transport (docs/results/packets.md).
+
+A session sends a keep-alive to a peer only if it has sent it nothing else for the lease's share, so every message takes
+a keep-alive's place.
 """
 
 from __future__ import annotations
@@ -17,6 +26,7 @@ from typing import Any, Final, Literal, assert_never
 import zenoh
 
 from companion.config import FleetConfig
+from companion.config.derived import KEEP_ALIVES, notice_lost_s
 from companion.errors import ConfigError
 from companion.io.transport import PAYLOAD_MAX_BYTES, PLAN_TOPIC, REQUEST_KINDS, STATE_TOPIC, VEHICLE_ID_MAX
 
@@ -54,6 +64,9 @@ class SessionSettings:
     """Zenoh endpoints of the others; all of them: peers do not relay"""
     scouting_port: int | None = None
     """UDP port of the laptop's scouting; None: derived from the fleet's name"""
+    notice_lost_s: float | None = None
+    """within this time the end of a session is noticed whose computer or radio is gone: the lease; None: the profile's
+    default"""
 
     def __post_init__(self) -> None:
         if not _FLEET_NAME.fullmatch(self.fleet_name):
@@ -84,13 +97,15 @@ class SessionSettings:
 def session_settings(config: FleetConfig, vehicle_id: int | None) -> SessionSettings:
     """The session of a vehicle, or of an operator (None)."""
     own = None if vehicle_id is None else config.by_id(vehicle_id).zenoh
+    others = [v.zenoh for v in config.vehicles if vehicle_id is None or v.id < vehicle_id]
     return SessionSettings(
         fleet_name=config.fleet.name,
         vehicle_id=vehicle_id,
         profile=config.peers.network,
         listen=() if own is None else (own,),
-        connect=tuple(v.zenoh for v in config.vehicles if v.zenoh is not None and v.id != vehicle_id),
+        connect=tuple(endpoint for endpoint in others if endpoint is not None),
         scouting_port=config.peers.scouting_port,
+        notice_lost_s=config.peers.notice_lost_s,
     )
 
 
@@ -110,8 +125,10 @@ def zenoh_configuration(settings: SessionSettings) -> zenoh.Config:
             assert_never(settings.profile)
     tree = {"mode": "peer", "namespace": settings.fleet_name, "timestamping": {"enabled": True}, **specific}
     tree["transport"]["shared_memory"] = {"enabled": False}
-    link = tree["transport"]["link"]
+    lease_s = notice_lost_s(settings.profile, settings.notice_lost_s)
+    link = tree["transport"].setdefault("link", {})
     link["rx"] = {"max_message_size": MESSAGE_MAX_BYTES}
+    link["tx"] = {"lease": round(1e3 * lease_s), "keep_alive": KEEP_ALIVES[settings.profile]}
     # An express message fills a whole batch, and of the default's two batches a link the third message within a
     # millisecond is dropped when the machine is busy. Smaller batches keep the memory of thirty links small.
     link["tx"] |= {"batch_size": 8192, "queue": {"size": {"real_time": 16, "interactive_high": 16}}}
@@ -172,9 +189,7 @@ def _laptop(settings: SessionSettings) -> dict[str, Any]:
         "listen": {"endpoints": list(settings.listen) or ["tcp/127.0.0.1:0"]},
         "connect": _connect(settings),
         "scouting": {"multicast": multicast, "gossip": {"enabled": False}},
-        # One keep-alive a second and link: they are most of an idle mesh's CPU (30 processes on two cores: 31 % of one
-        # core in all, 74 % with four a second), and a killed process shows by its closed connection, not by the lease.
-        "transport": {"link": {"tx": {"lease": 4000, "keep_alive": 4}}},
+        "transport": {},
     }
 
 
@@ -182,11 +197,9 @@ def _field(settings: SessionSettings) -> dict[str, Any]:
     return {
         "listen": {"endpoints": list(settings.listen)},
         "connect": _connect(settings),
-        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": True}},
-        "transport": {
-            "link": {"tx": {"lease": 2000, "keep_alive": 8}},
-            "unicast": {"max_links": 2, "open_timeout": 1000, "accept_timeout": 1000},
-        },
+        # Who hears by gossip of a session connects to it as well: a second connection of the pair.
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "transport": {"unicast": {"max_links": 1, "open_timeout": 1000, "accept_timeout": 1000}},
     }
 
 

@@ -1,5 +1,7 @@
 """Opens and closes Zenoh sessions."""
 
+from contextlib import suppress
+
 import zenoh
 
 from companion.io.transport import TransportError
@@ -17,6 +19,10 @@ def open_session(settings: SessionSettings) -> zenoh.Session:
 
 
 def close_session(session: zenoh.Session | None) -> None:
-    """End it, or its threads would keep the interpreter from ending; may be called again."""
+    """End it, or its threads would keep the interpreter from ending; may be called again.
+
+    One whose radio is gone cannot tell its peers in time, and has ended all the same.
+    """
     if session is not None and not session.is_closed():
-        session.close()  # type: ignore[no-untyped-call]
+        with suppress(zenoh.ZError):
+            session.close()  # type: ignore[no-untyped-call]

@@ -32,12 +32,13 @@ from companion.io.transport import (
     TOPICS,
     Event,
     Request,
+    Sent,
     TransportCounters,
     TransportError,
 )
 from companion.io.zenoh.configuration import SessionSettings
 from companion.io.zenoh.session import close_session, open_session
-from companion.io.zenoh.traffic import tcp_bytes_sent
+from companion.io.zenoh.traffic import TcpTraffic
 
 
 class ZenohTransport:
@@ -52,6 +53,7 @@ class ZenohTransport:
         self._own = f"fleet/{settings.vehicle_id}"
         self._inbox = Inbox(settings.vehicle_id, wake, bounds)
         self._session: zenoh.Session | None = None
+        self._traffic = TcpTraffic()
         self._closed = False
         self._publishers: dict[str, zenoh.ext.AdvancedPublisher] = {}
         self._declared: list[object] = []
@@ -138,9 +140,9 @@ class ZenohTransport:
         """A copy of the counts so far."""
         return self._inbox.counters
 
-    def bytes_sent(self) -> int:
+    def sent(self) -> Sent:
         """Over all TCP connections of this process: nothing else in it opens any."""
-        return tcp_bytes_sent()
+        return self._traffic.sent()
 
     def close(self) -> None:
         """Leave the fleet: the others see this vehicle vanish. May be called again."""

@@ -28,7 +28,7 @@ TICK_ROWS = np.dtype(
     [("fleet_ns", "i8"), *((name, _FORMATS[kind]) for name, kind in TickRecord.__annotations__.items())]
 )
 """a tick's time and the fields of TickRecord"""
-TRAFFIC_ROWS = np.dtype([("fleet_ns", "i8"), ("bytes_sent", "i8")])
+TRAFFIC_ROWS = np.dtype([("fleet_ns", "i8"), ("packets_sent", "i8"), ("bytes_sent", "i8")])
 POSITION = ("north_m", "east_m", "down_m")
 VELOCITY = ("north_m_s", "east_m_s", "down_m_s")
 """fields of TICK_ROWS, by axis"""

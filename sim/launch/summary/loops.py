@@ -1,6 +1,7 @@
 """How the companions' loops ran: gaps between setpoints, traffic, CPU."""
 
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 
@@ -26,16 +27,18 @@ def sent_gap_max_s(flight: Flight) -> float | None:
     return longest or None
 
 
-def wire_bytes_per_vehicle_s(flight: Flight, ids: Sequence[int], window: tuple[int, int]) -> float | None:
-    """Bytes a vehicle a second, from the counters told each second: between two of them they are taken to rise evenly,
-    so that a window shorter than their distance has a figure too."""
+def sent_per_vehicle_s(
+    flight: Flight, ids: Sequence[int], window: tuple[int, int], what: Literal["packets_sent", "bytes_sent"]
+) -> float | None:
+    """Packets or bytes a vehicle a second, from the counters told each second: between two of them they are taken to
+    rise evenly, so that a window shorter than their distance has a figure too."""
     rates = []
     for i in ids:
         rows = flight.traffic.get(i)
         if rows is not None and len(rows) > 1:
             begin, end = max(window[0], rows["fleet_ns"][0]), min(window[1], rows["fleet_ns"][-1])
             if end > begin:
-                sent = np.interp([begin, end], rows["fleet_ns"], rows["bytes_sent"])
+                sent = np.interp([begin, end], rows["fleet_ns"], rows[what])
                 rates.append((sent[1] - sent[0]) / ((end - begin) * 1e-9))
     return rounded(float(np.mean(rates))) if rates else None
 

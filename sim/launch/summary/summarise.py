@@ -14,7 +14,7 @@ from sim.launch.summary.believed import STEP_NS, believed_errors, times_of
 from sim.launch.summary.believed import minimum_distance_m as believed_minimum_m
 from sim.launch.summary.criteria import criteria
 from sim.launch.summary.flight import TICK_ROWS, Command, Flight
-from sim.launch.summary.loops import cpu_per_tick_ms, sent_gap_max_s, wire_bytes_per_vehicle_s
+from sim.launch.summary.loops import cpu_per_tick_ms, sent_gap_max_s, sent_per_vehicle_s
 from sim.launch.summary.numbers import per_vehicle, percentiles, rms, rounded, step_s
 from sim.launch.summary.steady import errors_from_slots, formed_ns, steady_at
 from sim.launch.summary.truth import attitude_rate_deg_s, minimum_distance, truth_of
@@ -52,6 +52,7 @@ def summarise(flight: Flight) -> dict[str, Any]:
     )  # fmt: skip
     puts = [p for p in flight.puts if window[0] <= p.time_ns <= window[1] and p.vehicle_id in staying]
     rate = len(puts) / max(len(staying), 1) / seconds if seconds else None
+    packets = sent_per_vehicle_s(flight, staying, window, "packets_sent")
     minimum, minimum_at_s = minimum_distance(flight.takeoff_ns, truth)
     ticks = [t for i, t in flight.ticks.items() if len(t)]
     believed = believed_errors(flight, history, staying, formed, window)
@@ -73,7 +74,10 @@ def summarise(flight: Flight) -> dict[str, Any]:
             "messages_per_vehicle_hz": rounded(rate, 5),
             "reduction_vs_20hz_percent": None if rate is None else rounded(100.0 * (1.0 - rate / REFERENCE_HZ), 3),
             "payload_bytes_per_vehicle_s": rounded(per_vehicle(sum(p.size for p in puts), staying, seconds)),
-            "wire_bytes_per_vehicle_s": wire_bytes_per_vehicle_s(flight, staying, window),
+            "network": config.peers.network,
+            "packets_per_vehicle_hz": packets,
+            "packets_reduction_vs_20hz_percent": packets_reduction_percent(packets, len(staying)),
+            "wire_bytes_per_vehicle_s": sent_per_vehicle_s(flight, staying, window, "bytes_sent"),
             "attitude_rate_rms_deg_s": attitude_rate_deg_s(flight.truth, window),
         },
         "believed": {
@@ -104,6 +108,15 @@ def summarise(flight: Flight) -> dict[str, Any]:
     }
     summary["criteria"] = criteria(summary, config, flight.centroid_limit_m)
     return {"passed": all(c["met"] for c in summary["criteria"]), **summary}
+
+
+def packets_reduction_percent(packets_hz: float | None, vehicles: int) -> float | None:
+    """How many packets fewer than at 20 Hz, at least: there each state is one to each peer, acknowledgements left out.
+
+    None where nothing was sent over a network, or there are no peers.
+    """
+    least = REFERENCE_HZ * (vehicles - 1)
+    return None if packets_hz is None or least <= 0 else rounded(100.0 * (1.0 - packets_hz / least), 2)
 
 
 def _command(command: Command, takeoff_ns: int) -> dict[str, Any]:
