@@ -38,7 +38,9 @@ SPACING_MARGIN_M = 0.2
 STALE_AFTER = 2.1
 """a peer is stale after this many T_max without a word: one message may be lost"""
 EXCHANGE_DELAY_S = 0.05
-"""delay to a peer, as the error bound takes it beside t_min and the control period"""
+"""delay to a peer, as the error bound takes it beside the control period"""
+COMMAND_LAG_S = 0.15
+"""from a command to the acceleration flown, as the error bound takes it: PX4's tilt on a quadrotor, and the stubs'"""
 
 
 class Vehicle(Table):
@@ -145,7 +147,9 @@ class FleetConfig(FleetTables):
             deviation_m_s2=max(x.avoidance_acceleration_m_s2, self.law.a_max_m_s2) + braking,
             drift_m_s=x.speed_max_m_s if self.law.hold == "zero" else 0.0,
             speed_m_s=2.0 * x.speed_max_m_s,
-            latency_s=EXCHANGE_DELAY_S + self.trigger.t_min_s + 1.0 / x.control_rate_hz,
+            lag_s=COMMAND_LAG_S,
+            latency_s=EXCHANGE_DELAY_S + 1.0 / x.control_rate_hz,
+            t_min_s=self.trigger.t_min_s,
             t_max_s=self.trigger.t_max_s,
         )
 
@@ -171,7 +175,8 @@ class FleetConfig(FleetTables):
         fly at each other need to stop, after what the exchange takes."""
         x = self.limits
         speed = x.speed_max_m_s
-        braking_m = speed * self.peer_motion.latency_s + speed**2 / (2.0 * x.avoidance_acceleration_m_s2)
+        heard_after_s = self.peer_motion.latency_s + self.trigger.t_min_s
+        braking_m = speed * heard_after_s + speed**2 / (2.0 * x.avoidance_acceleration_m_s2)
         return self.formation.spacing_m + 2.0 * braking_m
 
     @property
