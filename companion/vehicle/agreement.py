@@ -17,6 +17,7 @@ from companion.config import FleetConfig
 from companion.core.frames import Ned
 from companion.core.law.consensus import common_velocity_rate, saturated
 from companion.core.neighbours.table import PeerTable
+from companion.core.prediction import common_way
 from companion.core.trajectory.fleet import FleetTrajectory, TrajectoryState
 from companion.core.trajectory.legs import Leg, TurnLeg, VelocityLeg
 from companion.core.trajectory_check import PLAN_SPEED_SHARE
@@ -143,8 +144,12 @@ class Agreement:
         else:
             assert self._time_ns is not None
             dt_s = min((now.fleet_ns - self._time_ns) * 1e-9, STEP_MAX_S)
-            v = self._velocity
-            errors = [saturated(v.north - north, v.east - east, 0.0, SATURATION_M_S) for north, east in told]
+            v, a = self._velocity, self._acceleration
+            # The own one as the others predict it, so that of two the one comes as much nearer as the other.
+            here = common_way(CommonMotion(v.north, v.east, a.north, a.east), dt_s)
+            errors = [
+                saturated(here.north_m_s - north, here.east_m_s - east, 0.0, SATURATION_M_S) for north, east in told
+            ]
             north, east, _ = common_velocity_rate(
                 float(len(errors)), sum(e[0] for e in errors), sum(e[1] for e in errors), 0.0
             )

@@ -207,7 +207,7 @@ def test_a_common_motion_beyond_the_limits_is_flown_no_faster_than_they_allow() 
     one.tick(-STEP_S)
     for k in range(120):
         t = k * STEP_S
-        one.table.accept(liar.message(t, common=CommonMotion(20.0, 0.0, 0.0, 0.0)), at(t))
+        one.table.accept(liar.message(t, common=CommonMotion(5.0, 0.0, 0.0, 0.0)), at(t))
         one.tick(t)
     assert one.velocity.north == pytest.approx(0.75 * config.limits.speed_max_m_s)
 

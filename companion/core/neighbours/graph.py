@@ -17,8 +17,8 @@ from companion.core.frames import Ned
 NeighbourKind = Literal["all", "range", "nearest"]
 Graph = Mapping[int, Set[int]]
 """vehicle -> whom it is joined with, both ways"""
-POWER_STEPS = 300
-"""of the iteration for lambda_2: a percent for a hundred vehicles"""
+POWER_STEPS = 600
+"""of the iteration for lambda_2: it is told to a tenth, and never too small"""
 
 
 class Connectivity(NamedTuple):
