@@ -83,6 +83,12 @@ class One:
         ego = VehicleState(now.fleet_ns, self.position, self.velocity)
         return self.agreement.place(plan, moment, ego, self.heard, part, now).slot(plan.slots[self.id]).position_ned_m
 
+    def fly(self, seconds: float) -> None:
+        """One control tick, and the way that it means to fly until the next."""
+        self.tick(seconds)
+        p, v = self.position, self.velocity
+        self.position = Ned(p.north + STEP_S * v.north, p.east + STEP_S * v.east, p.down)
+
     @property
     def velocity(self) -> Ned:
         told = self.agreement.told
@@ -114,11 +120,7 @@ def flown(config: FleetConfig, seconds: float, wishes: dict[int, tuple[float, fl
     for k in range(1, round(seconds / STEP_S) + 1):
         all_hear(ones, (k - 1) * STEP_S)
         for one in ones:
-            one.tick(k * STEP_S)
-            v = one.velocity
-            one.position = Ned(
-                one.position.north + STEP_S * v.north, one.position.east + STEP_S * v.east, one.position.down
-            )
+            one.fly(k * STEP_S)
     return ones
 
 
@@ -148,7 +150,7 @@ def test_what_all_take_for_the_common_velocity_keeps_its_mean_and_becomes_one(be
     for k in range(2, 20):
         all_hear(ones, (k - 1) * STEP_S)
         for one in ones:
-            one.tick(k * STEP_S)
+            one.fly(k * STEP_S)
     after = mean_velocity(ones)
     assert hypot(after[0] - before[0], after[1] - before[1]) < 1e-6
     assert spread_m_s(ones) <= 0.1 * apart + 1e-6
