@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.core.formation import shape_slots
@@ -19,6 +19,7 @@ def line(count: int, nearest: int) -> dict[int, frozenset[int]]:
     return mutual_nearest(dict(enumerate(shape_slots("line", count, 4.0), 1)), nearest)
 
 
+@settings(deadline=None, max_examples=40)
 @given(slots, st.integers(1, 9))
 def test_whom_one_heeds_heeds_it_and_each_heeds_as_many_as_it_may(places: dict[int, Ned], nearest: int) -> None:
     graph = mutual_nearest(places, nearest)
@@ -26,6 +27,7 @@ def test_whom_one_heeds_heeds_it_and_each_heeds_as_many_as_it_may(places: dict[i
     assert all(len(graph[i]) >= min(nearest, len(places) - 1) for i in graph)
 
 
+@settings(deadline=None, max_examples=40)
 @given(slots, st.integers(1, 9))
 def test_lambda2_is_the_laplacians_second_eigenvalue(places: dict[int, Ned], nearest: int) -> None:
     graph = mutual_nearest(places, nearest)

@@ -17,7 +17,7 @@ from companion.core.frames import Ned
 NeighbourKind = Literal["all", "range", "nearest"]
 Graph = Mapping[int, Set[int]]
 """vehicle -> whom it is joined with, both ways"""
-INVERSE_STEPS = 12
+INVERSE_STEPS = 40
 """of the iteration for lambda_2: it is told to a few per cent, and never too small"""
 
 
