@@ -127,6 +127,7 @@ def _plan_faults(config: FleetConfig) -> Iterator[str]:
                         f"{where}.speed_m_s must be <= {level:g} m/s (3/4 of $.limits.speed_max_m_s), "
                         f"got {leg.speed_m_s:g}"
                     )
+    yield from _leaderless_faults(config)
     last = config.plan.legs[-1] if config.plan.legs else None
     if isinstance(last, VelocityLegTable) and last.up_m_s != 0.0 and config.plan.then == "stay":
         yield f"$.plan.legs[{len(config.plan.legs) - 1}].up_m_s must be 0 m/s in the last leg: it goes on for ever"
@@ -135,6 +136,33 @@ def _plan_faults(config: FleetConfig) -> Iterator[str]:
             "$.failsafe.battery_critical_percent must be <= $.failsafe.battery_low_percent = "
             f"{config.failsafe.battery_low_percent:g}, got {config.failsafe.battery_critical_percent:g}"
         )
+
+
+def _leaderless_faults(config: FleetConfig) -> Iterator[str]:
+    """What only a plan that all share can have, and what only a fleet without one."""
+    plan = config.plan
+    if plan.kind == "legs":
+        if plan.informed:
+            yield f'$.plan.informed belongs to $.plan.kind = "none", got {list(plan.informed)} with "legs"'
+        return
+    if plan.legs and not plan.informed:
+        yield (
+            f'$.plan.legs must be empty with $.plan.kind = "none", or flown by those named in $.plan.informed; '
+            f"got {len(plan.legs)} legs that nobody is to know"
+        )
+    if plan.then != "stay":
+        yield f'$.plan.then must be "stay" with $.plan.kind = "none": nobody tells the others, got "{plan.then}"'
+    if plan.heading != "fixed":
+        yield f'$.plan.heading must be "fixed" with $.plan.kind = "none", got "{plan.heading}"'
+    known = {v.id for v in config.vehicles}
+    for i in plan.informed:
+        if i not in known:
+            yield f"$.plan.informed must name enabled vehicles, got {i}"
+    for k, leg in enumerate(plan.legs):
+        if isinstance(leg, GotoLegTable):
+            yield f'$.plan.legs[{k}]: a "goto" needs a place that all share; with $.plan.kind = "none" there is none'
+        elif isinstance(leg, VelocityLegTable) and leg.up_m_s != 0.0:
+            yield f'$.plan.legs[{k}].up_m_s must be 0 m/s with $.plan.kind = "none", got {leg.up_m_s:g}'
 
 
 def _fence_faults(fence: FenceTable) -> Iterator[str]:
@@ -186,7 +214,7 @@ def _motion_faults(config: FleetConfig, formed: FleetTrajectory) -> Iterator[str
         yield _formation_sentence(fault)
         return
     planned, start_ns = formed, formed.blend_end_ns
-    if config.plan.legs:
+    if config.plan.kind == "legs" and config.plan.legs:
         now = formed.state_at(start_ns).centre
         legs = config.plan_legs(now.position, now.velocity)
         planned = with_legs(formed, at_ns=start_ns, issuer=0, legs=legs, then=config.plan.then)

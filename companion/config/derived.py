@@ -17,12 +17,13 @@ from companion.core import assignment
 from companion.core.formation import SHAPES, Slots, centred, minimum_distance, rotated, shape_slots
 from companion.core.frames import Geodetic, Ned
 from companion.core.monitor import PeerMotion
+from companion.core.neighbours.graph import NeighbourKind
 from companion.core.neighbours.sample import PeerLimits
 from companion.core.safety.fence import Fence
 from companion.core.safety.filter import DOWNWASH_RATIO, SafetyLimits, safety_radius_m
 from companion.core.trajectory.fleet import PADS, FleetTrajectory, top_speed_m_s
 from companion.core.trajectory.goto import goto_leg
-from companion.core.trajectory.legs import Leg, TurnLeg, VelocityLeg, leg_end
+from companion.core.trajectory.legs import FreeLeg, Leg, TurnLeg, VelocityLeg, leg_end
 from companion.core.trajectory.slots import SlotChange
 from companion.core.trajectory.successors import with_formation, with_return
 from companion.core.trajectory_check import ALTITUDE_MIN_M, PLAN_SPEED_SHARE, MotionLimits
@@ -49,6 +50,8 @@ PROCESS_END_S = 1.5
 T_MAX_S = 10.0
 SILENCES = 5.0
 """default of `trigger.t_max_s`: so many times `peers.notice_lost_s`, and T_MAX_S at most"""
+NEAREST_ABOVE = 20
+"""a larger fleet without a plan heeds the nearest, unless told otherwise"""
 EXCHANGE_DELAY_S = 0.05
 """delay to a peer, as the error bound takes it beside the control period"""
 COMMAND_LAG_S = 0.15
@@ -252,6 +255,13 @@ class FleetConfig(FleetTables):
         )  # fmt: skip
 
     @property
+    def neighbours(self) -> NeighbourKind:
+        """Whom the law heeds."""
+        if self.peers.neighbours != "auto":
+            return self.peers.neighbours
+        return "nearest" if self.plan.kind == "none" and len(self.vehicles) > NEAREST_ABOVE else "range"
+
+    @property
     def peer_limits(self) -> PeerLimits:
         return PeerLimits(
             hold=self.law.hold,
@@ -265,6 +275,8 @@ class FleetConfig(FleetTables):
             uncertainty_m=self.prediction_error_m,
             motion=self.peer_motion,
             digest_size=self.peers.digest,
+            neighbours=self.neighbours,
+            nearest=self.peers.nearest,
         )
 
     @property
@@ -361,6 +373,10 @@ class FleetConfig(FleetTables):
     def plan_legs(self, start: Ned, velocity: Ned = ZERO) -> tuple[Leg, ...]:
         """The plan's legs, begun at `start` with `velocity` (the centre's, m and m/s)."""
         return tuple(self._legs(self.plan.legs, start, velocity))
+
+    def shared_legs(self, start: Ned, velocity: Ned = ZERO) -> tuple[Leg, ...]:
+        """Those that all fly: the plan's, or without one the leg in which no motion is shared."""
+        return (FreeLeg(),) if self.plan.kind == "none" else self.plan_legs(start, velocity)
 
     def waypoint(self, start: Ned, velocity: Ned, table: GotoLegTable) -> Leg:
         """The leg to a waypoint from a place and a velocity of the centre, within the vertical limits."""

@@ -15,6 +15,7 @@ from companion.core.trajectory_check import (
     TURN_ANGLE_MAX_DEG,
     TURN_ANGLE_MIN_DEG,
     TURN_RATE_MAX_DEG_S,
+    VEHICLES_MAX,
     VELOCITY_MAX_M_S,
 )
 
@@ -88,6 +89,10 @@ LegTable = Annotated[HoldLegTable | VelocityLegTable | TurnLegTable | GotoLegTab
 class PlanTable(Table):
     """How the formation moves once all have formed."""
 
+    kind: Literal["legs", "none"] = "legs"
+    """none: no motion is shared; the vehicles agree on a velocity by what they publish"""
+    informed: Annotated[tuple[VehicleId, ...], Field(max_length=VEHICLES_MAX)] = ()
+    """with kind "none": the vehicles that know the legs and fly them; the others follow these by alignment"""
     legs: Annotated[tuple[LegTable, ...], Field(max_length=LEGS_MAX)] = ()
     heading: Literal["fixed", "track"] = "fixed"
     """track: the formation's heading follows turns"""
@@ -141,6 +146,10 @@ class PeersTable(Table):
     """Exchange between the vehicles."""
 
     range_m: Positive = 100.0
+    neighbours: Literal["auto", "all", "range", "nearest"] = "auto"
+    """whom the law heeds: everybody heard, those within the range, or the nearest by slots, mutually; auto: range, but
+    nearest in a fleet of more than twenty without a plan"""
+    nearest: Annotated[int, Field(ge=1, le=VEHICLES_MAX)] = 7
     digest: Annotated[int, Field(ge=0, le=30)] = 3
     """how many peers' latest samples a message carries"""
     wait_s: Wait = 60.0

@@ -67,6 +67,15 @@ class PeerDoubted:
 
 
 @dataclass(frozen=True, slots=True)
+class GraphNearBreaking:
+    """The graph of those that heed each other has fallen apart, or the loss of one vehicle would split it."""
+
+    edge: int
+    """the vehicle at its edge"""
+    lambda2: float
+
+
+@dataclass(frozen=True, slots=True)
 class NoWayBack:
     """The fleet's way back to its pads cannot be flown: the vehicle lands where it is."""
 
@@ -125,8 +134,9 @@ class RequestUnanswered:
 
 
 Event = (
-    PhaseChanged | MotionAdopted | FailsafeActed | FailsafeNoted | PeerDoubted | NoWayBack | KillCommanded | KillGivenUp
-    | Killed | ResumeGivenUp | AutopilotRebooted | OriginMoved | RequestRefused | RequestUnanswered
+    PhaseChanged | MotionAdopted | FailsafeActed | FailsafeNoted | PeerDoubted | GraphNearBreaking | NoWayBack
+    | KillCommanded | KillGivenUp | Killed | ResumeGivenUp | AutopilotRebooted | OriginMoved | RequestRefused
+    | RequestUnanswered
 )  # fmt: skip
 
 
@@ -143,6 +153,8 @@ def sentence(event: Event) -> str:
             return f"{failsafe.value}: {detail}"
         case PeerDoubted(vehicle_id, failsafe, detail):
             return f"vehicle {vehicle_id}: {failsafe.value}: {detail}"
+        case GraphNearBreaking(edge, lambda2):
+            return f"the graph of neighbours is near breaking: vehicle {edge} is at its edge, lambda2 {lambda2:.2f}"
         case NoWayBack(reason):
             return f"no way back to the pads: {reason}: land"
         case KillCommanded():

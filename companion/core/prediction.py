@@ -4,11 +4,19 @@ damped   p^ = p_k + [p_ref(t) - p_ref(t_k)] + T_d (1 - e^(-tau/T_d)) (v_k - v_d(
          v^ = v_d(t) + e^(-tau/T_d) (v_k - v_d(t_k))                            tau = t - t_k
 zero     p^ = p_k, v^ = v_k                                                     (the paper's)
 first    p^ = p_k + tau v_k, v^ = v_k
+
+Where no motion is shared, the sender's own estimate nu_k of the common velocity stands for v_d, and its rate a_k fades:
+
+         v_d(t_k + tau) = nu_k + a_k T_a (1 - e^(-tau/T_a)),   p_ref(t) - p_ref(t_k) its integral
 """
 
 from math import exp
 from typing import Literal, NamedTuple
 
+from companion.core.values import CommonMotion
+
+RATE_FADES_S = 2.0
+"""T_a: how long a common velocity goes on changing as it did"""
 HoldKind = Literal["damped", "zero", "first"]
 
 
@@ -55,4 +63,27 @@ def axis(
     return (
         p + w.plan * (ref_now - ref_then) + w.position * relative,
         w.plan * vref_now + w.velocity * relative,
+    )
+
+
+class CommonWay(NamedTuple):
+    """What a published common motion makes of a time since."""
+
+    north_m: float
+    """by so much the fleet has gone on"""
+    east_m: float
+    north_m_s: float
+    """and so fast it is now"""
+    east_m_s: float
+
+
+def common_way(common: CommonMotion, tau_s: float) -> CommonWay:
+    """The way and the velocity tau_s after a common motion was published."""
+    gained_s = RATE_FADES_S * (1.0 - exp(-tau_s / RATE_FADES_S))
+    way_s2 = RATE_FADES_S * (tau_s - gained_s)
+    return CommonWay(
+        common.north_m_s * tau_s + common.north_m_s2 * way_s2,
+        common.east_m_s * tau_s + common.east_m_s2 * way_s2,
+        common.north_m_s + common.north_m_s2 * gained_s,
+        common.east_m_s + common.east_m_s2 * gained_s,
     )

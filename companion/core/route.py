@@ -20,6 +20,7 @@ from companion.core.trajectory.fleet import FleetTrajectory, TrajectoryState
 from companion.core.trajectory.legs import (
     PLAN_ACCELERATION_M_S2,
     TURN_RAMP_S,
+    FreeLeg,
     GotoLeg,
     TurnLeg,
     VelocityLeg,
@@ -94,6 +95,9 @@ def _leg_spans(motion: FleetTrajectory, k: int, since_ns: int) -> Iterator[_Span
         case GotoLeg():
             bend = MINIMUM_JERK_BEND * dist(p, leg.target_ned_m) / duration**2 + 4.0 * hypot(*v) / duration
             yield _Span(k, since_ns, since_ns + round(duration * 1e9), bend, v == ZERO, 0.0, 0.0)
+        case FreeLeg():
+            # Where the fleet goes nobody knows: the safety filter keeps each vehicle inside.
+            yield _Span(k, since_ns, max(since_ns, motion.blend_end_ns), 0.0, True, 0.0, 0.0)
         case TurnLeg():
             rate = abs(turn_rate_and_time(leg)[0])
             turning = rate if motion.heading_follows_turns else 0.0

@@ -18,6 +18,7 @@ from companion.core.trajectory.fleet import REVISIONS, FleetTrajectory
 from companion.core.trajectory.goto import GOTO_ACCELERATION_M_S2, GotoPeaks, goto_peaks
 from companion.core.trajectory.legs import (
     TURN_RAMP_S,
+    FreeLeg,
     GotoLeg,
     TurnLeg,
     VelocityLeg,
@@ -106,6 +107,8 @@ def _form_fault(motion: FleetTrajectory) -> Fault | None:
     for k, leg in enumerate(motion.legs[:-1]):
         if isinstance(leg, TurnLeg) and leg.angle_rad == inf:
             return Fault(RefusalKind.ENDLESS, f"its leg {k} turns for ever, but legs follow", k)
+        if isinstance(leg, FreeLeg):
+            return Fault(RefusalKind.ENDLESS, f"its leg {k} is free and never ends, but legs follow", k)
     if not motion.slots:
         return Fault(RefusalKind.NO_SLOTS, "it has no slots")
     if motion.legs_start_ns > motion.start_ns:

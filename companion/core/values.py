@@ -69,6 +69,16 @@ class VehicleState(NamedTuple):
     velocity_ned_m_s: Ned
 
 
+class CommonMotion(NamedTuple):
+    """What a vehicle takes for the fleet's common velocity where no motion is shared, on the level (fleet frame)."""
+
+    north_m_s: float
+    east_m_s: float
+    north_m_s2: float
+    """the rate with which it changes"""
+    east_m_s2: float
+
+
 class PeerSample(NamedTuple):
     """One published state of a vehicle: its own, or another's passed on in a digest."""
 
@@ -80,6 +90,8 @@ class PeerSample(NamedTuple):
     revision: int
     """revision of the motion under which the sample was made"""
     phase: Phase
+    common: CommonMotion | None = None
+    """in formation, where no motion is shared; else None"""
 
 
 @dataclass(frozen=True, slots=True)

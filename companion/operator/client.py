@@ -19,18 +19,18 @@ from companion.config.schema import GotoLegTable
 from companion.core.frames import Ned
 from companion.core.route import only_stops
 from companion.core.trajectory.fleet import REVISIONS, FleetTrajectory
-from companion.core.trajectory.legs import Leg, TurnLeg, VelocityLeg
-from companion.core.trajectory.successors import with_legs
+from companion.core.trajectory.legs import FreeLeg, Leg, TurnLeg, VelocityLeg
+from companion.core.trajectory.successors import freed, going_on, with_legs
 from companion.core.trajectory_check import examine
 from companion.core.values import ZERO
 from companion.errors import RefusedError, WireError
 from companion.operator.clocks import clock_offsets
-from companion.operator.newest import newest_motion
+from companion.operator.newest import newest_motion, whereabouts
 from companion.operator.preflight import FleetReport, fleet_report
 from companion.operator.roster import RETRY_S, STATUS_TIMEOUT_S, Link, Roster
 from companion.terminal import one_line
 from companion.wire.operator import ENDING, Answer, Command, PreflightReport, Status, Verb, decode, encode
-from companion.wire.peer import motion_to_json
+from companion.wire.peer import leg_to_json, motion_to_json
 
 COMMAND_LEAD_NS = 2_000_000_000
 """how far ahead of now a commanded motion starts, so that every vehicle has it by then"""
@@ -98,14 +98,16 @@ class Operator:
     # -- commands ----------------------------------------------------------------------------------------------------
 
     def command(
-        self, verb: Verb, vehicle: int | None = None, *, confirm: bool = False, motion: FleetTrajectory | None = None
-    ) -> Answers:
-        """A verb to every vehicle or to one, asked again until each has answered or the time is over.
+        self, verb: Verb, vehicle: int | Iterable[int] | None = None, *, confirm: bool = False,
+        motion: FleetTrajectory | None = None, leg: Leg | None = None,
+    ) -> Answers:  # fmt: skip
+        """A verb to every vehicle, to one or to some, asked again until each has answered or the time is over.
 
         What ends a flight is commanded anew to whoever has begun another flight meanwhile, and to the silent, for whom
         nobody else waits; anything else to those alone whose place was not known.
         """
-        ids = self.ids if vehicle is None else (self.config.by_id(vehicle).id,)
+        named = (vehicle,) if isinstance(vehicle, int) else vehicle
+        ids = self.ids if named is None else tuple(self.config.by_id(i).id for i in dict.fromkeys(named))
         self.roster.refuse_doubles(ids, verb, both=self.both)
         ending = verb in ENDING
         unknown = frozenset(i for i in ids if not self.roster.places(i))
@@ -119,6 +121,7 @@ class Operator:
                 after={i: self.roster.places(i) for i in ids},
                 confirm=confirm,
                 motion=None if motion is None else motion_to_json(motion),
+                leg=None if leg is None else leg_to_json(leg),
             )
             last = self._ask(ids, command, timeout_s, None if motion is None else motion.revision)
             accepted += last.accepted
@@ -215,7 +218,16 @@ class Operator:
             # Slots that are still on their way to the last formation arrive there first.
             return self.config.motion_into(shape, newest, max(at_ns, newest.blend_end_ns), 0)
 
-        return self._follow(now_ns, formation)
+        return self._follow(now_ns, formation, keeps_free=True)
+
+    def free(self, now_ns: int) -> Answers:
+        """No motion is shared any more: the vehicles go on by what they tell each other."""
+        return self._follow(now_ns, lambda newest, at_ns: with_legs(newest, at_ns=at_ns, issuer=0, legs=(FreeLeg(),)))
+
+    def wish(self, leg: Leg | None, vehicles: Iterable[int]) -> Answers:
+        """Some vehicles are told where to draw the fleet, which flies no shared motion; None: nowhere any more."""
+        self.status()
+        return self.command("wish", vehicles, leg=leg)
 
     def move(self, leg: Leg, now_ns: int) -> Answers:
         """Another motion of the formation; RefusedError before it has formed by itself."""
@@ -255,9 +267,12 @@ class Operator:
         answers = self.move(VelocityLeg(ZERO, 0.0), clock_ns())
         return self.move(VelocityLeg(ZERO, 0.0), clock_ns()) if answers.outdated else answers
 
-    def _follow(self, now_ns: int, next_motion: Callable[[FleetTrajectory, int], FleetTrajectory]) -> Answers:
+    def _follow(
+        self, now_ns: int, next_motion: Callable[[FleetTrajectory, int], FleetTrajectory], *, keeps_free: bool = False
+    ) -> Answers:
         """Command the motion that follows the newest one, from a time soon after now (`now_ns`: UTC).
 
+        Where no motion is shared it begins where the vehicles say that they are; with `keeps_free` none is then either.
         RefusedError where there is none to follow, and for a motion that every vehicle would refuse.
         """
         statuses = self.status()
@@ -274,12 +289,21 @@ class Operator:
         if newest.revision == 0 and self.config.plan.automatic:
             # A motion of ours would take the place of the one by which the vehicles form.
             raise RefusedError("the fleet is not in formation yet")
-        motion = next_motion(newest, max(now_ns + COMMAND_LEAD_NS, newest.start_ns + 1))
+        free = newest.free_at(now_ns)
+        flown = going_on(newest, *_known(statuses, newest)) if free else newest
+        motion = next_motion(flown, max(now_ns + COMMAND_LEAD_NS, newest.start_ns + 1))
+        if free and keeps_free:
+            motion = freed(motion)
         fault = examine(motion, self.config.motion_limits, newest).fault
         if fault is not None and not only_stops(motion, newest):
             raise RefusedError(fault.sentence)
         answers = self.command("motion", motion=motion)
         return replace(answers, notes=(*left_out, *answers.notes))
+
+
+def _known(statuses: Mapping[int, Status | None], newest: FleetTrajectory) -> tuple[int, Ned, Ned]:
+    at_ns, position, velocity = whereabouts(statuses, newest)
+    return at_ns, Ned(*position), Ned(*velocity)
 
 
 def _answer(told: bytes) -> Answer | str:

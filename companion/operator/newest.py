@@ -3,11 +3,13 @@
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from math import isfinite
+from statistics import median
 
+from companion.core.frames import Ned
 from companion.core.trajectory.fleet import FleetTrajectory
 from companion.core.trajectory_check import REVISION_JUMP_MAX
-from companion.errors import WireError
-from companion.wire.operator import Status
+from companion.errors import RefusedError, WireError
+from companion.wire.operator import Status, Whereabouts
 from companion.wire.peer import motion_from_json
 
 MOTION_AHEAD_NS = 3_600_000_000_000
@@ -64,3 +66,24 @@ def _too_far_ahead(revisions: Mapping[int, int]) -> Iterator[int]:
     known = sorted(r for r in revisions.values() if r > 0) or [0]
     middle = known[(len(known) - 1) // 2]
     return (i for i, r in revisions.items() if r > middle + REVISION_JUMP_MAX)
+
+
+def whereabouts(statuses: Mapping[int, Status | None], newest: FleetTrajectory) -> Whereabouts:
+    """Where a fleet is that flies no shared motion: the middle of what its vehicles say, one by one axis.
+
+    Each says it by the mean of its neighbours' places. So it is as good as what they know of each other, and a second
+    old at most; a common velocity that changes adds to it what it changes until the next motion begins.
+    RefusedError if nobody says it.
+    """
+    told = [s.centre for s in statuses.values() if s is not None and s.centre is not None]
+    if not told:
+        raise RefusedError("no vehicle says where the formation is")
+    at_ns = max(c.time_ns for c in told)
+    rows = [
+        (*(p + v * (at_ns - c.time_ns) * 1e-9 for p, v in zip(c.position_ned_m, c.velocity_ned_m_s, strict=True)),
+         *c.velocity_ned_m_s)
+        for c in told
+    ]  # fmt: skip
+    north, east, down, v_north, v_east, _ = (median(column) for column in zip(*rows, strict=True))
+    height = newest.state_at(at_ns).centre.position.down if newest.free_at(at_ns) else down
+    return Whereabouts(at_ns, Ned(north, east, height), Ned(v_north, v_east, 0.0))

@@ -169,30 +169,43 @@ def move(
     ] = None,
     altitude: Annotated[float | None, typer.Option(min=1, max=500, help="With --goto: altitude (m).")] = None,
     speed: Annotated[float, typer.Option(min=0.1, max=8, help="With --goto: greatest speed (m/s).")] = 1.0,
+    free: Annotated[
+        bool,
+        typer.Option("--free", help="No shared motion: the vehicles agree on one. With --vehicle: forget its wish."),
+    ] = False,
+    vehicle: Annotated[
+        list[int] | None,
+        typer.Option(min=1, max=250, help="Tell this vehicle alone, and again for others: the rest follow unasked."),
+    ] = None,
     fleet: FleetFile = FLEET_TOML,
     vehicles: Vehicles = None,
 ) -> None:
-    """Change the formation's motion: one of --velocity, --turn, --goto.
+    """Change the formation's motion: one of --velocity, --turn, --goto, --free.
 
-    Examples: move --velocity 1 0 0; move --turn 6 90; move --goto 40 0 --speed 1.5.
+    With --vehicle only those named know it, in a fleet that flies without a shared motion.
+    Examples: move --velocity 1 0 0; move --turn 6 90; move --goto 40 0 --speed 1.5; move --vehicle 3 --velocity 1 0 0.
     """
     from companion.operator.client import turn_leg, velocity_leg
 
-    given = [f"--{name}" for name, value in (("velocity", velocity), ("turn", turn), ("goto", goto)) if value]
+    ways = (("velocity", velocity), ("turn", turn), ("goto", goto), ("free", free))
+    given = [f"--{name}" for name, value in ways if value]
     if len(given) != 1:
-        raise ConfigError(f"move needs exactly one of --velocity, --turn, --goto, got {' and '.join(given) or 'none'}")
+        came = " and ".join(given) or "none"
+        raise ConfigError(f"move needs exactly one of --velocity, --turn, --goto, --free, got {came}")
     if turn is not None and turn[0] == 0:
         raise ConfigError("move --turn: the rate must not be 0 deg/s, got 0; to stop the formation, use hold")
     if goto is None and altitude is not None:
         raise ConfigError(f"move --altitude belongs to --goto, got it with {given[0]}")
+    if goto is not None and vehicle:
+        raise ConfigError("move --goto is for all: a place is shared, and with --vehicle nobody shares one")
 
     def act(operator: "Operator") -> "Answers":
         now_ns = time.time_ns()
-        if velocity is not None:
-            return operator.move(velocity_leg(*velocity), now_ns)
-        if turn is not None:
-            return operator.move(turn_leg(turn[0], turn[1] or None), now_ns)
-        assert goto is not None
+        if goto is None:
+            leg = velocity_leg(*velocity) if velocity else turn_leg(turn[0], turn[1] or None) if turn else None
+            if vehicle:
+                return operator.wish(leg, vehicle)
+            return operator.free(now_ns) if leg is None else operator.move(leg, now_ns)
         return operator.goto(*goto, altitude, speed, now_ns)
 
     command(fleet, vehicles, "move", act)

@@ -23,6 +23,7 @@ from companion.core.trajectory.fleet import Reference, TrajectoryState
 from companion.core.trajectory.history import TrajectoryHistory
 from companion.core.values import (
     FILTERED_PHASES,
+    FORMATION_PHASES,
     SETTLED_PHASES,
     ZERO,
     Command,
@@ -34,8 +35,10 @@ from companion.core.values import (
 )
 from companion.errors import WireError
 from companion.vehicle import operator_port, plan_exchange
+from companion.vehicle.agreement import Agreement
 from companion.vehicle.autopilot.adapters import open_autopilot
 from companion.vehicle.autopilot.port import AutopilotPort, Heard
+from companion.vehicle.graph_watch import GraphWatch
 from companion.vehicle.guest import GUESTS, law_of, trigger_of
 from companion.vehicle.observer import StateObserver
 from companion.vehicle.operator_port import Activity, OperatorPort
@@ -82,15 +85,18 @@ class Agent:
         """what is flown, before the filter; tests and studies may put another in its place"""
         self.safety = SafetyFilter(config.safety_limits)
         self.observer = StateObserver()
+        self.agreement = Agreement(config, vehicle_id, self.peers)
+        self.graph = GraphWatch(vehicle_id, self.peers)
         self.supervisor = Supervisor(config, self.autopilot, self.history, self.peers, self._restart_filter)
         trigger = trigger_of(config, self.rejected)
         self.publisher = Publisher(config, vehicle_id, boot_id, trigger, self.history, self.peers, random)
         self.plans = PlanExchange(
-            config, vehicle_id, self.history, self.peers, self.supervisor, self.publisher, random, self.rejected
-        )
+            config, vehicle_id, self.history, self.peers, self.supervisor, self.publisher, self.agreement, random,
+            self.rejected,
+        )  # fmt: skip
         self.operator = OperatorPort(
             config, vehicle_id, boot_id, self.autopilot, self.supervisor, self.history, self.peers, self.plans,
-            self.publisher, self.rejected, OrderBook(boot_id),
+            self.publisher, self.agreement, self.graph, self.rejected, OrderBook(boot_id),
         )  # fmt: skip
         self.setpoints_sent = 0
         self._timer_ns = round(TIMER_SLACK * 1e9 / config.limits.control_rate_hz)
@@ -218,7 +224,7 @@ class Agent:
         plan = self.plans.due(now)
         if plan is not None:
             out.peers.append(("plan", plan))
-        for part in (self.supervisor, self.plans, self.peers, self.autopilot):
+        for part in (self.supervisor, self.plans, self.peers, self.graph, self.autopilot):
             out.events += part.events
             part.events.clear()
         return out
@@ -232,10 +238,14 @@ class Agent:
             self._publish_last_known(now)
             return
         ego = self._observe(*measured, now)
-        plan = self.history.at(now.fleet_ns)
-        formation = plan.state_at(now.fleet_ns)
-        reference = self.supervisor.follow(formation.slot(plan.slots[self.id]), ego, now)
+        plan, part = self.history.at(now.fleet_ns), self.phase in FORMATION_PHASES
+        shared = plan.state_at(now.fleet_ns)
+        slot = shared.slot(plan.slots[self.id])
+        formation = self.agreement.advance(plan, shared, self._neighbours, part, now)
         neighbours = self._predict(ego, formation, now)
+        formation = self.agreement.place(plan, formation, ego, neighbours, part, now)
+        own = slot if formation is shared else formation.slot(plan.slots[self.id])
+        reference = self.supervisor.follow(own, ego, now)
         residual, setpoint = ZERO, None
         if self.supervisor.steers:
             wanted = self._command(ego, reference, neighbours)
@@ -244,8 +254,9 @@ class Agent:
             self._steer(setpoint)
             self.publisher.see_near(self.safety.peer_planes, neighbours, reference.velocity_ned_m_s, now)
         self.supervisor.settle(ego, reference, now)
+        self.graph.look(plan, ego.position_ned_m, neighbours, part, now)
         self.plans.propose(now)
-        self._publish(reference, residual, now)
+        self._publish(slot, residual, now)
         self._report_tick(ego, reference, neighbours, setpoint is not None)
 
     # -- the stages ----------------------------------------------------------------------------------------------------
@@ -295,10 +306,11 @@ class Agent:
         self._outputs.mavlink.append(self.autopilot.setpoint(setpoint))
         self.setpoints_sent += 1
 
-    def _publish(self, reference: Reference, residual: Ned, now: Instant) -> None:
+    def _publish(self, slot: Reference, residual: Ned, now: Instant) -> None:
         """Tell the peers, if the publisher finds that they must be told."""
         since_ns, outdated = self.supervisor.formation_since_ns, self.supervisor.outdated
-        own = OwnState(self.phase, *self.observer.smoothed, reference, residual, since_ns, self.law.tell(), outdated)
+        common = self.agreement.told if self.phase in FORMATION_PHASES else None
+        own = OwnState(self.phase, *self.observer.smoothed, slot, residual, since_ns, self.law.tell(), outdated, common)
         message = self.publisher.publish(own, now)
         if message is not None:
             self._outputs.peers.append(("state", message))

@@ -61,10 +61,12 @@ class Follower:
             self._reference = Reference(ego.position_ned_m, ZERO, ZERO, slot.heading_rad)
             return self._reference
         jumps = before is not None and _apart_m(*before, slot, now.fleet_ns) > SLOT_JUMP_M
+        # Where no motion is shared the slot is where the neighbours are, and whoever comes or goes moves it.
+        free = self.flight.history.at(now.fleet_ns).free_at(now.fleet_ns)
         if self.flight.phase in FORMATION_PHASES:
             if self._engages and dist(ego.position_ned_m, slot.position_ned_m) > ENGAGED_AWAY_M:
                 self.stand(now)
-            elif jumps and self._reference is not None:
+            elif jumps and not free and self._reference is not None:
                 self.stand(now, listen_s=0.0)
                 self._set_out(slot, self._reference, now)
             self._engages = False

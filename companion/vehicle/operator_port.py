@@ -10,7 +10,9 @@ from companion.core.neighbours.table import PeerTable
 from companion.core.trajectory.history import TrajectoryHistory
 from companion.core.values import FLYING_PHASES, Instant, Phase
 from companion.errors import WireError
+from companion.vehicle.agreement import Agreement
 from companion.vehicle.autopilot.port import AutopilotPort
+from companion.vehicle.graph_watch import GraphWatch
 from companion.vehicle.orders import ORDER_FAULTS, OrderBook
 from companion.vehicle.outputs import TickReport
 from companion.vehicle.plan_exchange import PlanExchange
@@ -24,11 +26,12 @@ from companion.wire.operator import (
     Place,
     PreflightReport,
     Status,
+    Whereabouts,
     decode_command,
     encode,
     unmet,
 )
-from companion.wire.peer import motion_to_json
+from companion.wire.peer import leg_from_json, motion_to_json
 
 FAILSAFES_SHOWN_MAX = 20
 """the last ones stand in a status: one that comes again and again must not make it too large to be sent"""
@@ -61,6 +64,8 @@ class OperatorPort:
     peers: PeerTable
     plans: PlanExchange
     publisher: Publisher
+    agreement: Agreement
+    graph: GraphWatch
     rejected: Counts
     orders: OrderBook
 
@@ -104,6 +109,8 @@ class OperatorPort:
                 return self.supervisor.resume(now)
             case "kill":
                 return self.supervisor.kill(now) if command.confirm else "kill needs its confirmation"
+            case "wish":
+                return self._wish(command.leg, now)
         return self.plans.on_command(command.motion, now)
 
     def _take_off(self, now: Instant) -> str | None:
@@ -116,6 +123,21 @@ class OperatorPort:
             return "the plan is over: restart the companions for another flight"
         reasons = self.unready(now)
         return "; ".join(reasons) if reasons else self.supervisor.take_off(now)
+
+    def _wish(self, plain: object, now: Instant) -> str | None:
+        if plain is None:
+            self.agreement.inform((), now.fleet_ns)
+            return None
+        try:
+            leg = leg_from_json(plain)
+        except WireError as error:
+            return str(error)
+        if self.agreement.centre is None:
+            return "the fleet flies a motion that all share: command that one, or free it first"
+        reason = self.agreement.refusal(leg)
+        if reason is None:
+            self.agreement.inform((leg,), now.fleet_ns)
+        return reason
 
     def _refuse(self, refusal: Refusal, in_order: bool = True) -> bytes:
         self.rejected[f"command: {refusal.kind}"] += 1
@@ -186,7 +208,7 @@ class OperatorPort:
 
     def status(self, activity: Activity, now: Instant) -> Status:
         """The vehicle's account of itself, but for what only its process knows."""
-        tick = activity.tick
+        tick, graph = activity.tick, self.graph.connectivity
         unready, newest = unmet(self.checks(now)), self.history.newest
         rejected = self.rejected + self.supervisor.counts + self.peers.rejected
         return Status(
@@ -218,4 +240,8 @@ class OperatorPort:
             limited=activity.limited,
             own_id_heard=self.publisher.own_id_heard(now),
             motion=motion_to_json(newest),
+            centre=None if self.agreement.centre is None else Whereabouts(*self.agreement.centre),
+            informed=self.agreement.wish is not None,
+            lambda2=None if graph is None else graph.lambda2,
+            graph_edge=None if graph is None else graph.edge,
         )

@@ -16,10 +16,11 @@ from companion.core.events import Event, MotionAdopted
 from companion.core.neighbours.table import PeerTable
 from companion.core.trajectory.fleet import PADS, FleetTrajectory, motion_order
 from companion.core.trajectory.history import TrajectoryHistory
-from companion.core.trajectory.successors import assignment_matches, over_the_pads, with_legs
+from companion.core.trajectory.successors import assignment_matches, going_on, over_the_pads, with_legs
 from companion.core.trajectory_check import Fault, examine, revision_fault
 from companion.core.values import FILTERED_PHASES, SETTLED_PHASES, Instant, PeerMessage, Phase
 from companion.errors import ConfigError, WireError
+from companion.vehicle.agreement import Agreement
 from companion.vehicle.publisher import Publisher, spread_ns
 from companion.vehicle.supervisor import Supervisor
 from companion.wire.peer import WIRE_FAULTS, decode_motion, encode_motion, motion_from_json
@@ -63,7 +64,7 @@ class PlanExchange:
 
     def __init__(
         self, config: FleetConfig, vehicle_id: int, history: TrajectoryHistory, peers: PeerTable,
-        supervisor: Supervisor, publisher: Publisher, random: Random, rejected: Counts,
+        supervisor: Supervisor, publisher: Publisher, agreement: Agreement, random: Random, rejected: Counts,
     ) -> None:  # fmt: skip
         self.events: list[Event] = []
         """what was adopted; emptied by the agent"""
@@ -73,6 +74,7 @@ class PlanExchange:
         self._peers = peers
         self._supervisor = supervisor
         self._publisher = publisher
+        self._agreement = agreement
         self._random = random
         self._rejected = rejected
         self._spread_ns = spread_ns(len(config.vehicles))
@@ -175,8 +177,17 @@ class PlanExchange:
         if self._supervisor.phase not in FILTERED_PHASES:
             return 0.0
         at_ns = max(motion.start_ns, now.fleet_ns)
-        ours = self._history.reference(self._id, at_ns).position_ned_m
+        if motion.free_at(at_ns):
+            return 0.0
+        ours = self._flown(now).reference(self._id, at_ns).position_ned_m
         return dist(motion.reference(self._id, at_ns).position_ned_m, ours)
+
+    def _flown(self, now: Instant) -> FleetTrajectory:
+        """The newest motion; of one that is not shared, what this vehicle knows of it."""
+        newest, centre = self._history.newest, self._agreement.centre
+        if centre is None or not newest.free_at(now.fleet_ns):
+            return newest
+        return going_on(newest, *centre)
 
     def _foreign_slots(self, motion: FleetTrajectory) -> Fault | None:
         """Slots that this vehicle would not assign from its own configuration."""
@@ -246,9 +257,11 @@ class PlanExchange:
             case Proposal.FORM:
                 shape = self._config.formation.shape
                 self._adopt(self._config.motion_into(shape, newest, start_ns, self._id), now)
-            case Proposal.FLY if self._config.plan.legs:
+            case Proposal.FLY:
                 centre = newest.state_at(start_ns).centre
-                legs = self._config.plan_legs(centre.position, centre.velocity)
+                legs = self._config.shared_legs(centre.position, centre.velocity)
+                if not legs:
+                    return
                 then = self._config.plan.then
                 self._adopt(with_legs(newest, at_ns=start_ns, issuer=self._id, legs=legs, then=then), now)
 
@@ -273,7 +286,7 @@ class PlanExchange:
 
     def _propose_return(self, start_ns: int, now: Instant) -> None:
         """Propose the way back, or land here where it would lead outside the fence: the others would refuse it."""
-        motion = self._config.motion_home(self._history.newest, start_ns, self._id)
+        motion = self._config.motion_home(self._flown(now), start_ns, self._id)
         fault, _ = self._validate_trajectory(motion, now)
         if fault is None:
             self._adopt(motion, now)

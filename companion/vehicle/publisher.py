@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 from companion.config import FleetConfig
 from companion.core.frames import Ned
-from companion.core.neighbours.sample import predict_sample
 from companion.core.neighbours.table import PeerTable
+from companion.core.prediction import common_way
 from companion.core.safety.filter import HalfPlane, push_m_s2
 from companion.core.trajectory.fleet import Reference
 from companion.core.trajectory.history import TrajectoryHistory
@@ -23,6 +23,7 @@ from companion.core.values import (
     AIRBORNE_PHASES,
     FORMATION_PHASES,
     SETTLED_PHASES,
+    CommonMotion,
     Instant,
     Neighbour,
     PeerMessage,
@@ -63,7 +64,7 @@ class OwnState(NamedTuple):
     """smoothed, as the velocity is"""
     velocity_ned_m_s: Ned
     reference: Reference
-    """of the own slot, or of the way back to it"""
+    """of the own slot, by the shared motion"""
     mean_residual_m: Ned
     """of the formation about this vehicle"""
     formation_since_ns: int | None
@@ -72,6 +73,8 @@ class OwnState(NamedTuple):
     """what the own law adds to messages (`core.law.base.Law.tell`)"""
     outdated: bool = False
     """a peer holds a newer trajectory"""
+    common: CommonMotion | None = None
+    """what goes with the sample where no motion is shared"""
 
 
 class Publisher:
@@ -188,7 +191,7 @@ class Publisher:
             return None
         newest = self._history.newest
         sample = PeerSample(
-            self._id, now.fleet_ns, own.position_ned_m, own.velocity_ned_m_s, newest.revision, own.phase
+            self._id, now.fleet_ns, own.position_ned_m, own.velocity_ned_m_s, newest.revision, own.phase, own.common
         )
         self._sent = (sample, self._reference_then(sample))
         self._sent_ns, self._told = now.monotonic_ns, own.told
@@ -226,7 +229,7 @@ class Publisher:
 
     def _situation(self, sent: tuple[PeerSample, tuple[Ned, Ned]], own: OwnState, now: Instant) -> Situation:
         """What the trigger decides upon: the own state against what the peers predict of it."""
-        p, v = predict_sample(*sent, own.reference, now.fleet_ns, self._peers.limits)
+        p, v = self._peers.foresight.under(own.reference, *sent, now.fleet_ns)
         position, velocity, residual = own.position_ned_m, own.velocity_ned_m_s, own.mean_residual_m
         since_ns = own.formation_since_ns
         return Situation(
@@ -238,8 +241,17 @@ class Publisher:
             self._sent_ns + self._clock_shift_ns,
             self._told,
             own.told,
+            _common_error_2(sent[0], own.common, now),
         )
 
     def _reference_then(self, sample: PeerSample) -> tuple[Ned, Ned]:
         reference = self._history.reference(self._id, sample.time_ns)
         return reference.position_ned_m, reference.velocity_ned_m_s
+
+
+def _common_error_2(sent: PeerSample, common: CommonMotion | None, now: Instant) -> float:
+    """Squared error of what the peers take for the own estimate of the common velocity (m^2/s^2)."""
+    if sent.common is None or common is None:
+        return 0.0
+    way = common_way(sent.common, max(0.0, (now.fleet_ns - sent.time_ns) * 1e-9))
+    return (common.north_m_s - way.north_m_s) ** 2 + (common.east_m_s - way.east_m_s) ** 2

@@ -21,6 +21,7 @@ KINDS: dict[str, type[Event]] = {
     "failsafe": events.FailsafeActed,
     "failsafe noted": events.FailsafeNoted,
     "peer doubted": events.PeerDoubted,
+    "graph near breaking": events.GraphNearBreaking,
     "no way back": events.NoWayBack,
     "kill commanded": events.KillCommanded,
     "kill given up": events.KillGivenUp,

@@ -28,7 +28,7 @@ PLACES_MAX: Final = 8
 """so many companions of one vehicle id may be addressed at a time"""
 CLOCK_QUESTION: Final = b"clock"
 
-Verb = Literal["takeoff", "land", "motion", "release", "resume", "kill"]
+Verb = Literal["takeoff", "land", "motion", "wish", "release", "resume", "kill"]
 VERBS: Final[tuple[Verb, ...]] = get_args(Verb)
 ENDING: Final[frozenset[Verb]] = frozenset({"land", "release", "kill"})
 """what ends a flight"""
@@ -74,6 +74,8 @@ class Command:
     """of `kill`: a person was asked whether it is meant"""
     motion: Any = None
     """of `motion`: a fleet's trajectory (`wire.peer.motion_from_json`)"""
+    leg: Any = None
+    """of `wish`: where one vehicle is to draw the fleet (`wire.peer.leg_from_json`); None: nowhere any more"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -91,6 +93,16 @@ class Answer:
     """of its newest motion"""
     place: Place | None = None
     """None: it cannot say"""
+
+
+class Whereabouts(NamedTuple):
+    """Where a vehicle takes the formation's centre to be, and how fast it goes on; fleet frame, no motion being
+    shared."""
+
+    time_ns: _Count
+    """fleet time"""
+    position_ned_m: _Point
+    velocity_ned_m_s: _Point
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -144,6 +156,14 @@ class Status:
     """whether somebody else speaks under its id"""
     motion: dict[str, Any]
     """its newest (`wire.peer.motion_from_json`); whether anybody could follow it is another question"""
+    centre: Whereabouts | None = None
+    """None where a motion is shared, which tells it"""
+    informed: bool = False
+    """whether it has a wish where the fleet is to go"""
+    lambda2: _Number | None = None
+    """of the graph of those that heed each other, as it sees it"""
+    graph_edge: _VehicleId | None = None
+    """the vehicle at that graph's edge"""
     lateness_ms: _Number | None = None
     """of its last control tick; None: no process runs it"""
     dropped: _Count = 0

@@ -16,6 +16,7 @@ from companion.config import FleetConfig, load
 from companion.config.endpoints import autopilot_port, companion_port, serial_endpoint, udp_endpoint
 from companion.config.file import parse
 from companion.config.overrides import plan_legs, resize
+from companion.core.frames import Ned
 from companion.core.law.starling import StarlingLaw
 from companion.core.monitor import own_error_m
 from companion.core.safety.fence import Fence
@@ -687,3 +688,46 @@ def test_the_default_tables_are_not_touched_by_parsing() -> None:
     before = copy.deepcopy(tables)
     parse(tables, "fleet.toml")
     assert tables == before
+
+
+FREE = (put("plan.kind", "none"), put("plan.then", "stay"))
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        (FREE, "$.plan.legs must be empty with $.plan.kind"),
+        ((put("plan.kind", "none"), put("plan.legs", [])), '$.plan.then must be "stay"'),
+        ((*FREE, put("plan.legs", []), put("plan.heading", "track")), '$.plan.heading must be "fixed"'),
+        ((*FREE, put("plan.informed", [3, 99])), "$.plan.informed must name enabled vehicles, got 99"),
+        ((put("plan.informed", [3]),), "$.plan.informed belongs to $.plan.kind"),
+        (
+            (*FREE, put("plan.informed", [3]), put("plan.legs", [{"kind": "goto", "north_m": 1.0, "east_m": 0.0}])),
+            "needs a place that all share",
+        ),
+        (
+            (
+                *FREE, put("plan.informed", [3]),
+                put("plan.legs", [{"kind": "velocity", "up_m_s": 0.2, "duration_s": 1.0}]),
+            ),
+            "up_m_s must be 0 m/s",
+        ),
+    ],
+)  # fmt: skip
+def test_what_a_fleet_without_a_plan_cannot_have_is_refused(changes: tuple[Change, ...], said: str) -> None:
+    assert said in refusal(*changes)
+
+
+def test_a_fleet_without_a_plan_flies_a_free_leg_and_those_informed_have_the_files() -> None:
+    config = parse(changed(*FREE, put("plan.informed", [3, 7])), "fleet.toml")
+    assert [leg.kind for leg in config.shared_legs(Ned(0.0, 0.0, -10.0))] == ["free"]
+    assert [leg.kind for leg in config.plan_legs(Ned(0.0, 0.0, -10.0))] == ["velocity", "turn", "velocity", "velocity"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "count", "heeded"), [("none", 20, "range"), ("none", 21, "nearest"), ("legs", 30, "range")]
+)
+def test_a_large_fleet_without_a_plan_heeds_the_nearest(kind: str, count: int, heeded: str) -> None:
+    tables = changed(put("plan.kind", kind), put("plan.then", "stay"), put("plan.legs", []))
+    resize(tables, count)
+    assert parse(tables, "fleet.toml").neighbours == heeded

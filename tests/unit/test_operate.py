@@ -14,7 +14,7 @@ from statuses import FORMED
 from companion.config import FleetConfig, load
 from companion.core.frames import Ned
 from companion.core.trajectory.fleet import FleetTrajectory
-from companion.core.trajectory.legs import GotoLeg, TurnLeg, VelocityLeg
+from companion.core.trajectory.legs import FreeLeg, GotoLeg, TurnLeg, VelocityLeg
 from companion.core.trajectory.successors import over_the_pads, with_formation, with_legs
 from companion.errors import ConfigError, RefusedError
 from companion.operator.client import (
@@ -222,6 +222,51 @@ def test_hold_stops_the_centre_and_move_sends_it_on() -> None:
     link = fleet(held)
     Operator(CONFIG, link).move(velocity_leg(0.0, 1.0, 0.0), NOW_NS)
     assert link.motion().state_at(NOW_NS + 60_000_000_000).centre.velocity == pytest.approx((0.0, 1.0, 0.0))
+
+
+def drifting() -> Fleet:
+    """Without a shared motion, 30 m away from where that began, by what three say; one is far off, none is silent."""
+    link = fleet(with_legs(formed(), at_ns=NOW_NS - 10_000_000_000, issuer=1, legs=(FreeLeg(),)))
+    for i, (north, speed) in enumerate(((29.9, 0.5), (30.1, 0.5), (30.0, 0.5), (90.0, 3.0)), 1):
+        link.told[i] = {"centre": [NOW_NS, [north, 0.0, -10.0], [speed, 0.0, 0.0]]}
+    return link
+
+
+def test_a_shared_motion_begins_where_most_say_that_the_fleet_is() -> None:
+    link = drifting()
+    Operator(CONFIG, link).hold(lambda: NOW_NS)
+    motion = link.motion()
+    assert motion.free_from_ns is None
+    begun = motion.state_at(motion.start_ns).centre
+    assert begun.position == pytest.approx(Ned(30.05 + 1.0, 0.0, -10.0), abs=0.01)
+    assert begun.velocity == pytest.approx(Ned(0.5, 0.0, 0.0))
+
+
+def test_another_formation_leaves_a_free_fleet_free_and_a_shared_motion_can_be_freed() -> None:
+    link = drifting()
+    Operator(CONFIG, link).form("line", NOW_NS)
+    assert link.motion().free_from_ns is not None
+    assert link.motion().shape == "line"
+    link = fleet()
+    Operator(CONFIG, link).free(NOW_NS)
+    assert link.motion().free_from_ns is not None
+
+
+def test_nobody_commands_a_shared_motion_where_nobody_says_where_the_fleet_is() -> None:
+    link = drifting()
+    link.told.clear()
+    with pytest.raises(RefusedError, match="no vehicle says where the formation is"):
+        Operator(CONFIG, link).hold(lambda: NOW_NS)
+
+
+def test_a_wish_is_told_to_those_named_alone() -> None:
+    link = drifting()
+    answers = Operator(CONFIG, link).wish(velocity_leg(1.0, 0.0, 0.0), [3, 1])
+    assert answers.accepted == (1, 3)
+    told = {i: json.loads(payload) for i, kind, payload in link.came if kind == "command"}
+    assert sorted(told) == [1, 3]
+    assert told[1]["verb"] == "wish"
+    assert told[1]["leg"] == {"kind": "velocity", "velocity_ned_m_s": [1.0, 0.0, 0.0], "duration_s": 0.0}
 
 
 def test_goto_flies_the_centre_to_the_point_and_stops_there() -> None:

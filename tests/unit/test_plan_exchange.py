@@ -17,6 +17,7 @@ from companion.core.trajectory.legs import VelocityLeg
 from companion.core.trajectory.successors import with_legs
 from companion.core.values import ZERO, Instant, PeerMessage, PeerSample, Phase
 from companion.errors import WireError
+from companion.vehicle.agreement import Agreement
 from companion.vehicle.autopilot.px4 import Px4Autopilot
 from companion.vehicle.plan_exchange import PROPOSAL_DELAY_NS, PROPOSAL_SPREAD_NS, REJECTED, PlanExchange
 from companion.vehicle.publisher import Publisher, spread_ns
@@ -50,8 +51,9 @@ class One:
         self.publisher = Publisher(CONFIG, 1, 7, CONFIG.trigger_rule, self.history, self.peers, random)
         self.rejected = Counts(REJECTED)
         self.exchange = PlanExchange(
-            CONFIG, 1, self.history, self.peers, self.supervisor, self.publisher, random, self.rejected
-        )
+            CONFIG, 1, self.history, self.peers, self.supervisor, self.publisher, Agreement(CONFIG, 1, self.peers),
+            random, self.rejected,
+        )  # fmt: skip
 
     def fly(self, phase: Phase, now: Instant, revision: int | None = None) -> None:
         """This vehicle and both peers are in a phase, and say so."""

@@ -60,10 +60,11 @@ def test_each_verb_has_a_help_of_its_own(verb: str) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["move"], "move needs exactly one of --velocity, --turn, --goto, got none"),
+        (["move"], "move needs exactly one of --velocity, --turn, --goto, --free, got none"),
         (["move", "--turn", "6", "90", "--goto", "1", "2"], "got --turn and --goto"),
         (["move", "--turn", "0", "90"], "the rate must not be 0 deg/s, got 0; to stop the formation, use hold"),
         (["move", "--turn", "6", "90", "--altitude", "12"], "--altitude belongs to --goto, got it with --turn"),
+        (["move", "--vehicle", "3", "--goto", "1", "2"], "move --goto is for all"),
         (["land", "--fleet", "nowhere.toml"], "nowhere.toml: cannot be read"),
     ],
 )

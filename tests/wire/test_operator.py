@@ -66,7 +66,10 @@ WRONG: list[tuple[bytes, str, str]] = [
     (b"[]", "malformed", "needs a JSON object with a verb"),
     (b"[" * 60_000, "malformed", "needs a JSON object with a verb"),
     (changed(verb="left out"), "malformed", "needs a JSON object with a verb"),
-    (changed(verb="fly"), "unknown verb", "unknown verb 'fly'; known: takeoff, land, motion, release, resume, kill"),
+    (
+        changed(verb="fly"), "unknown verb",
+        "unknown verb 'fly'; known: takeoff, land, motion, wish, release, resume, kill",
+    ),
     (changed(verb=3), "unknown verb", "unknown verb 3;"),
     (changed(id=""), "id", "id must be a text of up to 64 characters, got ''"),
     (changed(id="left out"), "id", "got nothing"),

@@ -15,7 +15,7 @@ from companion.core.frames import Ned
 from companion.core.law.base import FIELDS_MAX
 from companion.core.trajectory.fleet import FleetTrajectory
 from companion.core.trajectory.goto import GOTO_MIN_S
-from companion.core.trajectory.legs import GotoLeg, Leg, TurnLeg, VelocityLeg
+from companion.core.trajectory.legs import FreeLeg, GotoLeg, Leg, TurnLeg, VelocityLeg
 from companion.core.trajectory.slots import BLEND_MIN_S, SlotChange
 from companion.core.trajectory_check import (
     DURATION_MAX_S,
@@ -27,9 +27,11 @@ from companion.core.trajectory_check import (
     TURN_RATE_MIN_RAD_S,
     VELOCITY_MAX_M_S,
 )
-from companion.core.values import PeerMessage, PeerSample, Phase
+from companion.core.values import CommonMotion, PeerMessage, PeerSample, Phase
 from companion.errors import WireError
 from companion.wire.peer import (
+    COMMON,
+    COMMON_MAX,
     PLAUSIBLE_MAX,
     VERSION,
     decode_motion,
@@ -43,7 +45,9 @@ words = st.integers(0, 2**32 - 1)
 times = st.integers(-(2**63), 2**63 - 1)
 singles = st.floats(-PLAUSIBLE_MAX, PLAUSIBLE_MAX, width=32)
 vectors = st.builds(Ned, singles, singles, singles)
-samples = st.builds(PeerSample, bytes_8, times, vectors, vectors, words, st.sampled_from(Phase))
+rates_and_speeds = st.floats(-COMMON_MAX, COMMON_MAX, width=32)
+commons = st.none() | st.builds(CommonMotion, *[rates_and_speeds] * 4)
+samples = st.builds(PeerSample, bytes_8, times, vectors, vectors, words, st.sampled_from(Phase), commons)
 near_ids = st.sets(bytes_8, max_size=12).map(lambda ids: tuple(sorted(ids)))
 messages = st.builds(
     PeerMessage, words, words, times, bytes_8, samples, st.lists(samples, max_size=6).map(tuple), near_ids,
@@ -61,6 +65,7 @@ legs: st.SearchStrategy[Leg] = st.one_of(
     st.builds(VelocityLeg, velocities, seconds),
     st.builds(TurnLeg, rates, st.floats(TURN_ANGLE_MIN_RAD, TURN_ANGLE_MAX_RAD) | st.just(inf)),
     st.builds(GotoLeg, places, st.floats(GOTO_MIN_S, DURATION_MAX_S)),
+    st.just(FreeLeg()),
 )
 nanoseconds = st.integers(0, 2**63 - 1)
 motions = st.builds(
@@ -104,6 +109,32 @@ def test_a_state_costs_what_is_said_of_it() -> None:
     alone = len(encode_state(PeerMessage(0, 0, 0, 0, SAMPLE, ())))
     assert alone == 59
     assert len(encode_state(MESSAGE)) == alone + 2 * 38 + 2
+
+
+def test_a_common_motion_costs_17_bytes_a_sample_and_one_for_all() -> None:
+    told = SAMPLE._replace(common=CommonMotion(1.0, 0.0, 0.5, 0.0))
+    message = replace(MESSAGE, sample=told, digest=(SAMPLE, told))
+    assert len(encode_state(message)) == len(encode_state(MESSAGE)) + 1 + 2 * 17
+
+
+@pytest.mark.parametrize(
+    ("tail", "kind"),
+    [
+        (b"\x00", "length"),
+        (b"\x04" + 4 * struct.pack("<B4f", 0, 0.0, 0.0, 0.0, 0.0), "length"),
+        (b"\x01" + struct.pack("<B4f", 3, 0.0, 0.0, 0.0, 0.0), "common"),
+        (b"\x02" + 2 * struct.pack("<B4f", 1, 0.0, 0.0, 0.0, 0.0), "common"),
+        (b"\x01" + struct.pack("<B4f", 0, nan, 0.0, 0.0, 0.0), "not finite"),
+        (b"\x01" + struct.pack("<B4f", 0, 20.1, 0.0, 0.0, 0.0), "out of range"),
+        (b"\x01" + struct.pack("<B4f", 0, 1.0, 0.0, 0.0, 0.0) + b"\x00", "length"),
+    ],
+)
+def test_a_damaged_common_motion_is_refused(tail: bytes, kind: str) -> None:
+    payload = bytearray(encode_state(MESSAGE))
+    payload[FLAGS_AT] |= COMMON
+    with pytest.raises(WireError) as refused:
+        decode_state(bytes(payload) + tail)
+    assert refused.value.kind == kind
 
 
 @pytest.mark.parametrize("near", [(4, 2), (2, 2)])

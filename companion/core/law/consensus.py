@@ -1,11 +1,12 @@
 """Flight without a plan: agreement on the common velocity from what the vehicles publish.
 
-Each vehicle starts its estimate nu_i from its own velocity and then follows
+Each vehicle has an estimate nu_i of the common velocity, zero at hover, and
 
-    nu_i' = -2 mean_j sat(nu_i - nu_j)            over the nu_j that were last published, saturated at 1 m/s
+    nu_i' = -2 mean_j sat(nu_i - nu_j)            over the nu_j as they follow from what was last published
 
-Nothing is measured again afterwards, so sensor noise cannot random-walk it. nu_i stands for v_d in the law, and a
-sample is held with the nu under which it was sent: p_ref(t) - p_ref(t_k) = nu_k tau and v_d = nu_k (`hold.axis`).
+saturated at 1 m/s. Nothing is measured, so sensor noise cannot random-walk it; between vehicles that all hear each
+other the mean of the nu_i stays what it was. nu_i stands for v_d in the law and in the hold (`core.prediction`). Who is
+told where to go has its wish for nu_i, and draws the others: nobody passes the wish on.
 """
 
 from math import sqrt

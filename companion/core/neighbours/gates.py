@@ -20,8 +20,11 @@ def is_outlier(velocity_north: float, velocity_east: float, residual_north: floa
     )
 
 
-def outliers(neighbours: Sequence[Neighbour], ego: Ned) -> frozenset[int]:
-    """Ids of those in formation whose prediction is far from what the others' say."""
+def outliers(neighbours: Sequence[Neighbour], ego: Ned, *, free: bool = False) -> frozenset[int]:
+    """Ids of those in formation whose prediction is far from what the others' say.
+
+    Where no motion is shared (`free`), velocities are compared with their median: the vehicles are still to agree.
+    """
     residuals = []
     for n in neighbours:
         if n.in_formation:
@@ -30,9 +33,14 @@ def outliers(neighbours: Sequence[Neighbour], ego: Ned) -> frozenset[int]:
     if not residuals:
         return frozenset()
     middle_north, middle_east = median(r[1] for r in residuals), median(r[2] for r in residuals)
+    slow_north = slow_east = 0.0
+    if free:
+        slow_north = median(n.velocity_ned_m_s.north - n.reference_velocity_ned_m_s.north for n, _, _ in residuals)
+        slow_east = median(n.velocity_ned_m_s.east - n.reference_velocity_ned_m_s.east for n, _, _ in residuals)
     gated = []
     for n, north, east in residuals:
         v, slot = n.velocity_ned_m_s, n.reference_velocity_ned_m_s
-        if is_outlier(v.north - slot.north, v.east - slot.east, north - middle_north, east - middle_east):
+        v_north, v_east = v.north - slot.north - slow_north, v.east - slot.east - slow_east
+        if is_outlier(v_north, v_east, north - middle_north, east - middle_east):
             gated.append(n.vehicle_id)
     return frozenset(gated)

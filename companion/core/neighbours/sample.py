@@ -1,11 +1,13 @@
 """What one sample says about another time: senders and receivers call the same function, so they agree."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 from companion.core.frames import Ned, new
 from companion.core.monitor import PeerMotion
-from companion.core.prediction import HoldKind, axis, weights
+from companion.core.neighbours.graph import NeighbourKind
+from companion.core.prediction import HoldKind, axis, common_way, weights
 from companion.core.trajectory.fleet import Reference
 from companion.core.trajectory.history import TrajectoryHistory
 from companion.core.values import AIRBORNE_PHASES, FORMATION_PHASES, ZERO, PeerSample, Phase
@@ -39,6 +41,9 @@ class PeerLimits:
     motion: PeerMotion
     """what a peer can do unseen"""
     digest_size: int
+    neighbours: NeighbourKind = "range"
+    """whom the law heeds (`core.neighbours.graph`)"""
+    nearest: int = 7
 
 
 def predict_sample(
@@ -97,4 +102,47 @@ class Foresight(NamedTuple):
     def at(self, sample: PeerSample, reference_then: tuple[Ned, Ned], fleet_ns: int) -> tuple[Ned, Ned]:
         """Position and velocity at a time."""
         reference = self.history.reference(sample.vehicle_id, fleet_ns)
+        return self.under(reference, sample, reference_then, fleet_ns)
+
+    def under(
+        self, reference: Reference, sample: PeerSample, reference_then: tuple[Ned, Ned], fleet_ns: int
+    ) -> tuple[Ned, Ned]:
+        """The same, where the slot's shared reference at that time is known."""
+        if sample.common is not None and sample.phase in FORMATION_PHASES:
+            reference_then, reference = self._with_common_motion(reference, sample, reference_then, fleet_ns)
         return predict_sample(sample, reference_then, reference, fleet_ns, self.limits)
+
+    def _with_common_motion(
+        self, reference: Reference, sample: PeerSample, reference_then: tuple[Ned, Ned], fleet_ns: int
+    ) -> tuple[tuple[Ned, Ned], Reference]:
+        """What stands for p_ref and v_d, then and now, of a sample made where no motion was shared.
+
+        The slot goes the way that is shared, and the sender's common motion on top as long as none is. A motion that
+        takes over begins where the fleet is by then, wherever that is: only the way since counts.
+        """
+        common, then_ns, history = sample.common, sample.time_ns, self.history
+        assert common is not None
+        shared_then, v_then = reference_then
+        free_s = max(0.0, (fleet_ns - then_ns) * 1e-9)
+        motion, now = history.at(then_ns), history.at(fleet_ns)
+        if not motion.free_at(then_ns):
+            # Its sender did not know of the motion that all shared by then.
+            return reference_then, reference
+        way = [b - a for a, b in zip(shared_then, reference.position_ned_m, strict=True)]
+        if motion is not now:
+            way, free_s = [0.0, 0.0, 0.0], 0.0
+            starts = sorted(m.start_ns for m in history.motions if then_ns < m.start_ns < fleet_ns)
+            for from_ns, to_ns in pairwise((then_ns, *starts, fleet_ns)):
+                motion = history.at(from_ns)
+                a, b = (motion.reference(sample.vehicle_id, t).position_ned_m for t in (from_ns, to_ns))
+                way = [w + q - p for w, p, q in zip(way, a, b, strict=True)]
+                if motion.free_at(from_ns):
+                    free_s += (to_ns - from_ns) * 1e-9
+        gone = common_way(common, free_s)
+        v = reference.velocity_ned_m_s
+        if now.free_at(fleet_ns):
+            v = Ned(v.north + gone.north_m_s, v.east + gone.east_m_s, v.down)
+        return (
+            (ZERO, Ned(v_then.north + common.north_m_s, v_then.east + common.east_m_s, v_then.down)),
+            Reference(Ned(way[0] + gone.north_m, way[1] + gone.east_m, way[2]), v, ZERO, 0.0),
+        )

@@ -14,10 +14,12 @@ from companion.core.failsafe import SUSPECT_S, Failsafe
 from companion.core.frames import Ned, new
 from companion.core.neighbours import examination, silence
 from companion.core.neighbours.gates import GATE_PERIOD_NS, outliers
+from companion.core.neighbours.graph import Graph, mutual_nearest
 from companion.core.neighbours.lost import nearest_piece
-from companion.core.neighbours.sample import Foresight, PeerLimits, aloft, predict_sample
+from companion.core.neighbours.sample import Foresight, PeerLimits, aloft
 from companion.core.neighbours.track import Peer, Track
-from companion.core.trajectory.fleet import Reference, TrajectoryState
+from companion.core.prediction import common_way
+from companion.core.trajectory.fleet import FleetTrajectory, Reference, TrajectoryState
 from companion.core.trajectory.history import TrajectoryHistory
 from companion.core.trigger.near import near_bound_m
 from companion.core.values import (
@@ -72,12 +74,15 @@ class PeerTable:
     """when the gates are looked at anew (monotonic ns)"""
     _deaf_from_ns: int | None = None
     """fleet time from which nobody's states are heard any more, if nothing comes before"""
-    _foresight: Foresight = field(init=False)
+    _joined: tuple[FleetTrajectory, Graph] | None = None
+    """the slots' graph, and the motion whose it is"""
+    foresight: Foresight = field(init=False)
+    """what samples say about other times, the own ones to the peers included"""
     _stale_ns: int = field(init=False)
 
     def __post_init__(self) -> None:
         self._peers = {i: Peer() for i in sorted(self.ids)}
-        self._foresight = Foresight(self.history, self.limits)
+        self.foresight = Foresight(self.history, self.limits)
         self._stale_ns = round(self.limits.stale_after_s * 1e9)
 
     # -- what is heard -------------------------------------------------------------------------------------------------
@@ -120,7 +125,7 @@ class PeerTable:
 
     def _hear(self, peer: Peer, sample: PeerSample, boot_id: int, now: Instant) -> str | None:
         """A sample that came from the peer itself, or from whoever speaks under its id."""
-        matching = [t for t in peer.tracks if examination.explains(t, sample, self._foresight)]
+        matching = [t for t in peer.tracks if examination.explains(t, sample, self.foresight)]
         earlier = [t for t in matching if t.sample.time_ns < sample.time_ns]
         if matching and not earlier:
             return "repeated or out of order"
@@ -130,7 +135,7 @@ class PeerTable:
             return "repeated or out of order"
         anew = peer.boot_id != boot_id
         self._count_sources(peer, sample, boot_id, now)
-        reference = self._foresight.reference_then(sample)
+        reference = self.foresight.reference_then(sample)
         if earlier:
             track, *others = earlier
             # What explains one sample together is one vehicle.
@@ -153,7 +158,7 @@ class PeerTable:
         """Another place where the peer may be; of too many, the one that lasted the shortest goes."""
         track = Track(sample, reference, sample.time_ns, None, same_since_ns=sample.time_ns)
         if peer.tracks:
-            track.reached = any(examination.leads_to(t, sample, self._foresight) for t in peer.tracks)
+            track.reached = any(examination.leads_to(t, sample, self.foresight) for t in peer.tracks)
             self.rejected[Failsafe.PEER_LIES.value] += 1
             if sample.time_ns >= peer.noted_until_ns:
                 peer.noted_until_ns = sample.time_ns + self._stale_ns
@@ -184,21 +189,21 @@ class PeerTable:
     def _overhear(self, peer: Peer, sample: PeerSample, now: Instant) -> bool:
         """A sample that another peer has passed on; whether it agrees with what is known."""
         if not peer.tracks:
-            self._open(peer, sample, self._foresight.reference_then(sample))
+            self._open(peer, sample, self.foresight.reference_then(sample))
             return True
         if sample.time_ns <= peer.tracks[0].sample.time_ns:
             return True
-        track = next((t for t in peer.tracks if examination.explains(t, sample, self._foresight)), None)
+        track = next((t for t in peer.tracks if examination.explains(t, sample, self.foresight)), None)
         if track is None or sample.time_ns <= track.sample.time_ns:
             return track is not None
         if track.own is not None and track.lost_at_ns is None:
             said, reference_then = track.own
             if now.fleet_ns - said.time_ns <= (self.limits.heartbeat_s + silence.HEARTBEAT_MARGIN_S) * 1e9:
-                foreseen, _ = self._foresight.at(said, reference_then, sample.time_ns)
+                foreseen, _ = self.foresight.at(said, reference_then, sample.time_ns)
                 moved = dist(foreseen, sample.position_ned_m) > HEARSAY_M
                 if moved or (said.phase in FORMATION_PHASES) is not (sample.phase in FORMATION_PHASES):
                     return False
-        track.take(sample, self._foresight.reference_then(sample))
+        track.take(sample, self.foresight.reference_then(sample))
         if track.lost_at_ns is not None and (track.silent or sample.time_ns > track.lost_at_ns):
             track.lost_at_ns = None  # it is alive though it is not heard here
         return True
@@ -232,6 +237,14 @@ class PeerTable:
         """The latest sample of a peer, its own or by digest."""
         tracks = self._peers[vehicle_id].tracks
         return tracks[0].sample if tracks else None
+
+    def common_velocity_m_s(self, vehicle_id: int, now: Instant) -> tuple[float, float] | None:
+        """What a peer takes for the fleet's common velocity by now (north, east); None if it tells none."""
+        sample = self.sample(vehicle_id)
+        if sample is None or sample.common is None:
+            return None
+        way = common_way(sample.common, max(0.0, (now.fleet_ns - sample.time_ns) * 1e-9))
+        return way.north_m_s, way.east_m_s
 
     def due_soon(self, vehicle_id: int) -> bool:
         """Whether a peer last said that it speaks in near mode, so that its messages are known to be due."""
@@ -281,9 +294,9 @@ class PeerTable:
         """Look the references of the samples up again, after a motion was adopted."""
         for peer in self._peers.values():
             for track in peer.tracks:
-                track.reference_then = self._foresight.reference_then(track.sample)
+                track.reference_then = self.foresight.reference_then(track.sample)
                 if track.own is not None:
-                    track.own = (track.own[0], self._foresight.reference_then(track.own[0]))
+                    track.own = (track.own[0], self.foresight.reference_then(track.own[0]))
                 track.path = []
 
     def predict(
@@ -291,12 +304,19 @@ class PeerTable:
     ) -> list[Neighbour]:
         """Every known peer within range, predicted to now under the plan at that `moment`, in the order of the ids.
 
+        Where the law heeds all whom it hears, those out of range are among them.
+
+        Where no motion is shared, `moment` has the common motion as this vehicle takes it to be, and each peer is
+        predicted by its own.
+
         Of a lost one the nearest place where it may be must be within range. One that may be in two places is there
         twice. With `gated` (only once formed), peers whose prediction is far from what the others' say drop from
         alignment and cohesion; they still count for separation. With `above_ground` (before landing) the place above
         one that stands on the ground or lands is taken too, up to the own altitude.
         """
-        slots = self.history.at(now.fleet_ns).slots
+        motion = self.history.at(now.fleet_ns)
+        slots, free = motion.slots, motion.free_at(now.fleet_ns)
+        shared = motion.state_at(now.fleet_ns) if free else moment
         own = moment.slot(slots[self.own_id]).position_ned_m
         neighbours = []
         for i, peer in self._peers.items():
@@ -306,26 +326,38 @@ class PeerTable:
                 peer.tracks = examination.undisproved(peer.tracks, self._stale_ns, now)
             reference = moment.slot(slots[i])
             for track in peer.tracks:
-                n = self._predict(peer, track, ego_ned_m, now, reference, own)
+                n = self._predict(
+                    peer, track, ego_ned_m, now, reference, own, shared.slot(slots[i]) if free else reference
+                )
                 if above_ground and track.sample.phase in LOW_PHASES:
                     p = n.position_ned_m
                     n = n._replace(last_seen_ned_m=p._replace(down=min(p.down, ego_ned_m.down)))
                 place = n.position_ned_m
                 if n.last_seen_ned_m is not None:
                     place = lerp(place, n.last_seen_ned_m, closest_point_parameter(ego_ned_m, place, n.last_seen_ned_m))
-                if dist(place, ego_ned_m) <= self.limits.range_m:
+                if dist(place, ego_ned_m) <= self.limits.range_m or self.limits.neighbours == "all":
                     neighbours.append(n)
+        if self.limits.neighbours == "nearest":
+            heeded = self.joined(motion)[self.own_id]
+            neighbours = [n if n.vehicle_id in heeded else n._replace(in_formation=False) for n in neighbours]
         if not gated:
             return neighbours
         if now.monotonic_ns >= self._gated_until_ns:
             self._gated_until_ns = now.monotonic_ns + GATE_PERIOD_NS
-            self._gated = outliers(neighbours, ego_ned_m)
+            self._gated = outliers(neighbours, ego_ned_m, free=free)
         if not self._gated:
             return neighbours
         return [n._replace(in_formation=False) if n.vehicle_id in self._gated else n for n in neighbours]
 
+    def joined(self, motion: FleetTrajectory) -> Graph:
+        """Who is whose neighbour in a motion's slots, where the nearest are."""
+        if self._joined is None or self._joined[0] is not motion:
+            after = {i: change.after for i, change in motion.slots.items()}
+            self._joined = motion, mutual_nearest(after, self.limits.nearest)
+        return self._joined[1]
+
     def _predict(
-        self, peer: Peer, track: Track, ego_ned_m: Ned, now: Instant, reference: Reference, own: Ned
+        self, peer: Peer, track: Track, ego_ned_m: Ned, now: Instant, reference: Reference, own: Ned, shared: Reference
     ) -> Neighbour:
         limits, sample = self.limits, track.sample
         follows = sample.phase in FORMATION_PHASES
@@ -338,9 +370,9 @@ class PeerTable:
         if lost_at_ns is not None and aloft(sample):
             since_s = (now.fleet_ns - lost_at_ns) * 1e-9
             uncertainty += min(UNCERTAINTY_GROWTH_M_S * max(since_s, 0.0), UNCERTAINTY_GROWTH_MAX_M)
-            position, velocity, other_end = nearest_piece(track, ego_ned_m, now.fleet_ns, self._foresight)
+            position, velocity, other_end = nearest_piece(track, ego_ned_m, now.fleet_ns, self.foresight)
         else:
-            position, velocity = predict_sample(sample, track.reference_then, reference, now.fleet_ns, limits)
+            position, velocity = self.foresight.under(shared, sample, track.reference_then, now.fleet_ns)
             if peer.due_soon:
                 uncertainty = near_bound_m(tau_s, uncertainty, limits.motion)
             if not follows and aloft(sample) and sample.phase not in FLYING_PHASES:

@@ -16,6 +16,7 @@ from companion.core.trajectory.goto import goto_peaks
 from companion.core.trajectory.legs import (
     TURN_RAMP_S,
     CentreState,
+    FreeLeg,
     GotoLeg,
     Leg,
     VelocityLeg,
@@ -151,6 +152,17 @@ class FleetTrajectory:
     def blend_end_ns(self) -> int:
         """Fleet time at which the slots are those of the new formation."""
         return self.blend_start_ns + round(self.blend_s * 1e9)
+
+    @cached_property
+    def free_from_ns(self) -> int | None:
+        """Fleet time from which no common motion is shared; None: it always is."""
+        if not self.legs or not isinstance(self.legs[-1], FreeLeg):
+            return None
+        return max(self.legs_start_ns + round(self.leg_starts[len(self.legs) - 1][0] * 1e9), self.start_ns)
+
+    def free_at(self, fleet_ns: int) -> bool:
+        """Whether no common motion is shared at a time."""
+        return self.free_from_ns is not None and fleet_ns >= self.free_from_ns
 
     @property
     def returns(self) -> bool:

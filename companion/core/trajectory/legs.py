@@ -10,6 +10,7 @@ from typing import Literal, NamedTuple
 
 from companion.core.frames import Ned
 from companion.core.trajectory.polynomials import fading, minimum_jerk
+from companion.core.values import ZERO
 
 PLAN_ACCELERATION_M_S2 = 0.5
 """the largest acceleration with which a leg changes the centre's velocity"""
@@ -61,7 +62,17 @@ class GotoLeg:
     kind: Literal["goto"] = "goto"
 
 
-Leg = VelocityLeg | TurnLeg | GotoLeg
+@dataclass(frozen=True, slots=True)
+class FreeLeg:
+    """No common motion that all share, for ever: the vehicles agree on one by what they publish (`core.agreement`).
+
+    What is shared goes on: slots, heading, altitude. The centre stands in it, and the common motion comes on top.
+    """
+
+    kind: Literal["free"] = "free"
+
+
+Leg = VelocityLeg | TurnLeg | GotoLeg | FreeLeg
 
 
 class CentreState(NamedTuple):
@@ -82,6 +93,8 @@ def leg_duration_s(leg: Leg, v0: Ned) -> float:
             return turn_rate_and_time(leg)[1]
         case GotoLeg():
             return leg.duration_s
+        case FreeLeg():
+            return inf
 
 
 def leg_end(leg: Leg, p0: Ned, v0: Ned) -> tuple[float, Ned, Ned, float]:
@@ -102,6 +115,8 @@ def along(leg: Leg, p0: Ned, v0: Ned, t: float) -> CentreState:
             return _turn_leg(leg, p0, v0, t)
         case GotoLeg():
             return _goto_leg(leg, p0, v0, t)
+        case FreeLeg():
+            return CentreState(p0, ZERO, ZERO, 0.0, 0.0, 0.0)
 
 
 def _velocity_leg(leg: VelocityLeg, p0: Ned, v0: Ned, t: float) -> CentreState:

@@ -12,7 +12,7 @@ from companion.core.formation import Slots
 from companion.core.frames import Ned
 from companion.core.trajectory.fleet import PADS, FleetTrajectory, Then
 from companion.core.trajectory.goto import goto_leg
-from companion.core.trajectory.legs import TURN_RAMP_S, GotoLeg, Leg, VelocityLeg
+from companion.core.trajectory.legs import TURN_RAMP_S, FreeLeg, GotoLeg, Leg, VelocityLeg
 from companion.core.trajectory.slots import SlotChange, blend_duration_s
 from companion.core.values import ZERO
 from companion.core.vectors import lerp
@@ -44,6 +44,36 @@ def with_legs(
         heading_follows_turns=motion.heading_follows_turns if heading_follows_turns is None else heading_follows_turns,
         legs=legs,
         then=then,
+    )
+
+
+def going_on(motion: FleetTrajectory, at_ns: int, position_ned_m: Ned, velocity_ned_m_s: Ned) -> FleetTrajectory:
+    """A motion whose centre is not shared, as if it went on from where it is: what takes over starts there."""
+    heading = motion.state_at(at_ns).heading_rad
+    return replace(
+        motion,
+        start_ns=min(motion.start_ns, at_ns),
+        legs_start_ns=at_ns,
+        centre_ned_m=position_ned_m,
+        velocity_ned_m_s=velocity_ned_m_s,
+        heading_rad=heading,
+        heading_rate_rad_s=0.0,
+        legs=(VelocityLeg(velocity_ned_m_s, 0.0),),
+    )
+
+
+def freed(motion: FleetTrajectory) -> FleetTrajectory:
+    """The same motion with nothing shared of its centre's from its start on."""
+    now = motion.state_at(motion.start_ns)
+    return replace(
+        motion,
+        legs_start_ns=motion.start_ns,
+        centre_ned_m=now.centre.position,
+        velocity_ned_m_s=now.centre.velocity,
+        heading_rad=now.heading_rad,
+        heading_rate_rad_s=now.rate,
+        legs=(FreeLeg(),),
+        then="stay",
     )
 
 

@@ -37,6 +37,9 @@ class Situation(NamedTuple):
     """the law's own numbers (`Law.fields`) in the last message"""
     tells: tuple[float, ...] = ()
     """the same as they would be sent now"""
+    error_common_2: float = 0.0
+    """squared error of what the peers take for the own estimate of the common velocity, where no motion is shared
+    (m^2/s^2)"""
 
 
 class Trigger(Protocol):

@@ -1,6 +1,8 @@
 """The default trigger: Eq. (4) of the paper with a fixed threshold, raised a little by the formation's residual.
 
 send when |e_p|^2 + gamma |e_v|^2 >= epsilon^2 + min(kappa |residual|, 0.1 m)^2
+
+and, where no motion is shared, when |e_nu| >= epsilon_nu, the error of the published common velocity.
 """
 
 from math import hypot
@@ -19,9 +21,12 @@ class ErrorTrigger(NamedTuple):
     epsilon_m: float
     gamma_s2: float
     kappa: float
+    epsilon_nu_m_s: float = 0.05
 
     def fires(self, now: Situation) -> bool:
-        """Eq. (4) with the threshold epsilon, raised by the residual."""
+        """Eq. (4) with the threshold epsilon, raised by the residual; and the common velocity's own threshold."""
+        if now.error_common_2 >= self.epsilon_nu_m_s * self.epsilon_nu_m_s:
+            return True
         return exceeds(now.error_position_2, now.error_velocity_2, now.mean_residual_2, self)
 
     def error_bound_m(self, motion: PeerMotion) -> float:

@@ -39,7 +39,7 @@ def believed_errors(
     times = times_of(flight, ids)
     times = times[steady_at(flight, history, times, formed) & (times >= window[0]) & (times <= window[1])]
     motion = (_motion(flight, ids, times, axes) for axes in (POSITION, VELOCITY))
-    return errors_from_slots(history, ids, times, *motion)
+    return errors_from_slots(flight.config, history, ids, times, *motion)
 
 
 def minimum_distance_m(flight: Flight, ids: Sequence[int]) -> float | None:

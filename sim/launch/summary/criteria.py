@@ -20,7 +20,11 @@ def criteria(summary: Mapping[str, Any], config: FleetConfig, centroid_limit_m: 
     rows: list[tuple[str, Any, str, float]] = [
         *([(distance, nearest, ">=", 0.3 * spacing)] if len(config.vehicles) > 1 else []),
         (f"{source}.formation_error_rms_m", summary[source]["formation_error_rms_m"], "<=", 0.075 * spacing),
-        (f"{source}.centroid_error_rms_m", summary[source]["centroid_error_rms_m"], "<=", centroid_limit_m),
+        *(
+            [(f"{source}.centroid_error_rms_m", summary[source]["centroid_error_rms_m"], "<=", centroid_limit_m)]
+            if config.plan.kind == "legs"
+            else []
+        ),
         ("setpoint_gap_max_s", summary["setpoint_gap_max_s"], "<=", SETPOINT_GAP_MAX_S),
         *([("touchdown_max_m_s", summary["touchdown_max_m_s"], "<=", TOUCHDOWN_MAX_M_S)] if source == "steady" else []),
         ("failsafes", len(summary["failsafes"]), "<=", 0),

@@ -6,7 +6,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from companion.config import FleetConfig
 from companion.core.events import PhaseChanged
+from companion.core.neighbours.graph import among, connectivity, mutual_nearest
+from companion.core.trajectory.fleet import FleetTrajectory
 from companion.core.trajectory.history import TrajectoryHistory
 from companion.core.values import Phase
 from sim.launch.summary.flight import Array, Flight
@@ -18,7 +21,6 @@ SETTLING_S = 3.0
 WINDOW_S = 10.0
 LEFT_FORMATION = frozenset({Phase.IDLE, Phase.RETURNING, Phase.LANDING, Phase.LANDED, Phase.RELEASED})
 """phases with which the steady part ends"""
-CONNECTED_WITHIN_M = 100.0
 
 
 def formed_ns(flight: Flight, staying: Sequence[int]) -> int | None:
@@ -49,9 +51,12 @@ def steady_at(flight: Flight, history: TrajectoryHistory, times: Array, formed: 
 
 
 def errors_from_slots(
-    history: TrajectoryHistory, ids: Sequence[int], times: Array, position: Array, velocity: Array
+    config: FleetConfig, history: TrajectoryHistory, ids: Sequence[int], times: Array, position: Array, velocity: Array
 ) -> dict[str, Any]:
-    """Errors of formation, velocity, centroid and altitude; positions and velocities over (time, vehicle, axis)."""
+    """Errors of formation, velocity, centroid and altitude; positions and velocities over (time, vehicle, axis).
+
+    Where no motion is shared the centroid has no place to be at: it counts where one is (None: never).
+    """
     names = ("formation_error_rms_m", "velocity_error_rms_m_s", "centroid_error_rms_m")
     if not len(times):
         return {**dict.fromkeys(names), "altitude_error_max_m": None, "lambda2_min": None, "windows": []}
@@ -64,8 +69,10 @@ def errors_from_slots(
         v_ref = np.array([s.velocity_ned_m_s for s in slots])
         formation.append(np.square(formation_error_m(p, p_ref)).mean())
         consensus.append(np.square(velocity_error_m_s(v, v_ref)).mean())
-        centroid.append(centroid_error_m(p, p_ref) ** 2)
+        if not motion.free_at(int(t)):
+            centroid.append(centroid_error_m(p, p_ref) ** 2)
         altitude.append(np.abs(p[:, 2] - p_ref[:, 2]).max())
+    step = max(len(position) // 20, 1)
     windows = []
     start = int(times[0])
     for k in range(int((times[-1] - start) * 1e-9 / WINDOW_S) + 1):
@@ -80,11 +87,23 @@ def errors_from_slots(
             )
     return {
         **{
-            n: rounded(float(np.sqrt(np.mean(x)))) for n, x in zip(names, (formation, consensus, centroid), strict=True)
+            n: rounded(float(np.sqrt(np.mean(x)))) if x else None
+            for n, x in zip(names, (formation, consensus, centroid), strict=True)
         },
         "altitude_error_max_m": rounded(float(np.max(altitude))),
         "lambda2_min": rounded(
-            min(algebraic_connectivity(p, CONNECTED_WITHIN_M) for p in position[:: max(len(position) // 20, 1)])
+            min(_lambda2(config, history.at(int(times[k])), ids, position[k]) for k in range(0, len(times), step))
         ),
         "windows": windows,
     }
+
+
+def _lambda2(config: FleetConfig, motion: FleetTrajectory, ids: Sequence[int], position: Array) -> float:
+    """Of the graph in use: of who heeds whom, by places or by slots."""
+    match config.neighbours:
+        case "nearest":
+            after = {i: change.after for i, change in motion.slots.items()}
+            return connectivity(among(mutual_nearest(after, config.peers.nearest), set(ids))).lambda2
+        case "all":
+            return algebraic_connectivity(position, np.inf)
+    return algebraic_connectivity(position, config.peers.range_m)

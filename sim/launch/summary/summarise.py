@@ -47,7 +47,7 @@ def summarise(flight: Flight) -> dict[str, Any]:
         seconds = len(inside) * STEP_NS * 1e-9
         window = (int(inside[0]), int(inside[-1])) if len(inside) else (0, 0)
     figures = errors_from_slots(
-        history, staying, times[steady], truth.position_ned_m[steady][:, columns],
+        config, history, staying, times[steady], truth.position_ned_m[steady][:, columns],
         truth.velocity_ned_m_s[steady][:, columns],
     )  # fmt: skip
     puts = [p for p in flight.puts if window[0] <= p.time_ns <= window[1] and p.vehicle_id in staying]
