@@ -50,7 +50,9 @@ T_MAX_S = 10.0
 SILENCES = 5.0
 """default of `trigger.t_max_s`: so many times `peers.notice_lost_s`, and T_MAX_S at most"""
 EXCHANGE_DELAY_S = 0.05
-"""delay to a peer, as the error bound takes it beside t_min and the control period"""
+"""delay to a peer, as the error bound takes it beside the control period"""
+COMMAND_LAG_S = 0.15
+"""from a command to the acceleration flown, as the error bound takes it: PX4's tilt on a quadrotor, and the stubs'"""
 
 
 def notice_lost_s(network: str, value: float | None) -> float:
@@ -181,7 +183,9 @@ class FleetConfig(FleetTables):
             deviation_m_s2=max(x.avoidance_acceleration_m_s2, self.law.a_max_m_s2) + braking,
             drift_m_s=x.speed_max_m_s if self.law.hold == "zero" else 0.0,
             speed_m_s=2.0 * x.speed_max_m_s,
-            latency_s=EXCHANGE_DELAY_S + self.trigger.t_min_s + 1.0 / x.control_rate_hz,
+            lag_s=COMMAND_LAG_S,
+            latency_s=EXCHANGE_DELAY_S + 1.0 / x.control_rate_hz,
+            t_min_s=self.trigger.t_min_s,
             t_max_s=self.trigger.t_max_s,
         )
 
@@ -207,7 +211,8 @@ class FleetConfig(FleetTables):
         fly at each other need to stop, after what the exchange takes."""
         x = self.limits
         speed = x.speed_max_m_s
-        braking_m = speed * self.peer_motion.latency_s + speed**2 / (2.0 * x.avoidance_acceleration_m_s2)
+        heard_after_s = self.peer_motion.latency_s + self.trigger.t_min_s
+        braking_m = speed * heard_after_s + speed**2 / (2.0 * x.avoidance_acceleration_m_s2)
         return self.formation.spacing_m + 2.0 * braking_m
 
     @property

@@ -5,10 +5,17 @@ slot or plan is no jump to them.
 """
 
 from dataclasses import dataclass, field
+from functools import cache
 from math import exp, hypot
 
 OBSERVER_RATE_RAD_S = 1.5
 """omega of the bias observer"""
+POSITION_RATE_PER_S = 2.0
+"""send filter: position from position"""
+CROSS_RATE_PER_S2 = 1.0
+"""send filter: velocity from position"""
+VELOCITY_RATE_PER_S = 5.0
+"""send filter: velocity from velocity"""
 
 
 @dataclass(slots=True)
@@ -44,8 +51,8 @@ def alpha_beta(
     error_p = measured_p - predicted_p
     error_v = measured_v - predicted_v
     return (
-        predicted_p + (1.0 - exp(-2.0 * dt_s)) * error_p,
-        predicted_v + dt_s * error_p + (1.0 - exp(-5.0 * dt_s)) * error_v,
+        predicted_p + (1.0 - exp(-POSITION_RATE_PER_S * dt_s)) * error_p,
+        predicted_v + CROSS_RATE_PER_S2 * dt_s * error_p + (1.0 - exp(-VELOCITY_RATE_PER_S * dt_s)) * error_v,
     )
 
 
@@ -54,7 +61,7 @@ class SendFilter:
     """Alpha-beta filter of one axis with the flown acceleration as its input.
 
     What is compared by the trigger and sent to the peers: events fire at extremes of noise, and the raw state would
-    send outliers. Rates: position from position 2 /s, velocity from position 1 /s^2, velocity from velocity 5 /s.
+    send outliers. What the vehicle flies beside that acceleration it follows late (`gust_lag`, `command_lag`).
     """
 
     position_m: float | None = None
@@ -70,6 +77,42 @@ class SendFilter:
         self.position_m, self.velocity_m_s = alpha_beta(
             self.position_m, self.velocity_m_s, position_m, velocity_m_s, acceleration_m_s2, dt_s
         )
+
+
+def gust_lag() -> tuple[float, float]:
+    """How far the send filter's position and velocity end up behind, per constant acceleration that it is not told of.
+
+    With d the unknown acceleration, e = p_f - p and w = v_f - v: e' = w - 2 e, w' = -d - e - 5 w, so e = -d/11 and
+    w = -2 d/11. The response of e + T w to an impulse of d has one sign for times ahead T up to 2.6 s: no d within that
+    size makes it larger, and no sinusoid passes better. (s^2, s)
+    """
+    position = 1.0 / (CROSS_RATE_PER_S2 + VELOCITY_RATE_PER_S * POSITION_RATE_PER_S)
+    return position, POSITION_RATE_PER_S * position
+
+
+@cache
+def command_lag(lag_s: float) -> tuple[tuple[float, float], ...]:
+    """How far the send filter's (position, velocity) run ahead of a vehicle whose acceleration follows its command
+    late by a first order, per step of the command.
+
+    They are told of the command at once. Given are the moments from the greatest velocity error (about 0.2 s after the
+    step) to the greatest position error: at a time T ahead, the largest position error is the largest e + T w of them,
+    and by their sign no command that stays within the step's size makes a larger one. (s^2, s)
+    """
+    if lag_s <= 0.0:
+        return ((0.0, 0.0),)
+    dt_s = 0.001
+    follows = 1.0 - exp(-dt_s / lag_s)
+    acceleration = p = v = filtered_p = filtered_v = 0.0
+    seen: list[tuple[float, float]] = []
+    while len(seen) < 2 or seen[-1][0] > seen[-2][0]:
+        for _ in range(20):
+            acceleration += follows * (1.0 - acceleration)
+            p += dt_s * v + 0.5 * dt_s * dt_s * acceleration
+            v += dt_s * acceleration
+            filtered_p, filtered_v = alpha_beta(filtered_p, filtered_v, p, v, 1.0, dt_s)
+        seen.append((filtered_p - p, filtered_v - v))
+    return tuple(seen[max(range(len(seen)), key=lambda k: seen[k][1]) :])
 
 
 @dataclass(slots=True)

@@ -63,15 +63,17 @@ class Sent:
 
 @dataclass(slots=True)
 class BoundCount:
-    """How the true error of near peers' predictions compares with what their receivers take it to be at most."""
+    """How the true error of predictions compares with what their receivers take it to be at most."""
 
     looks: int = 0
-    """predictions of a peer that speaks in near mode, one a control tick and pair"""
+    """predictions, one a control tick and pair"""
     exceeded: int = 0
     """of those, how many are farther from the truth than their bound"""
     worst: float = 0.0
     """largest error as a part of its bound"""
     error_max_m: float = 0.0
+    millimetres: Counter[int] = field(default_factory=Counter)
+    """how many predictions were wrong by so many"""
 
     def see(self, error_m: float, bound_m: float) -> None:
         """Take one prediction."""
@@ -79,6 +81,16 @@ class BoundCount:
         self.exceeded += not error_m <= bound_m
         self.worst = max(self.worst, error_m / bound_m)
         self.error_max_m = max(self.error_max_m, error_m)
+        self.millimetres[int(error_m * 1e3)] += 1
+
+    def quantile_m(self, share: float) -> float:
+        """The error that this share of all predictions does not exceed (m), to the millimetre."""
+        below = 0
+        for millimetres, count in sorted(self.millimetres.items()):
+            below += count
+            if below >= share * self.looks:
+                return 1e-3 * (millimetres + 1)
+        return 0.0
 
 
 @dataclass(slots=True)
@@ -102,6 +114,9 @@ class Lockstep:
     own_id_heard: Counter[int] = field(default_factory=Counter)
     """puts that reached a vehicle under its own id"""
     near_bound: BoundCount = field(default_factory=BoundCount)
+    """of peers that speak in near mode"""
+    bound: BoundCount = field(default_factory=BoundCount)
+    """of all others that fly in formation under their law"""
     _truth: list[bytes] = field(default_factory=list)
     _net: Network = field(init=False)
     _queue: list[tuple[int, int, Callable[..., None], tuple[Any, ...]]] = field(default_factory=list)
@@ -258,13 +273,14 @@ class Lockstep:
         """Of a peer that may be at several places, one must hold it: the one that comes nearest to its own bound."""
         seen: dict[int, tuple[float, float, float]] = {}
         for n in agent.neighbours:
-            if n.last_seen_ned_m is None and agent.peers.due_soon(n.vehicle_id):
+            near, flies = agent.peers.due_soon(n.vehicle_id), self.vehicles[n.vehicle_id].agent.supervisor.steers
+            if n.last_seen_ned_m is None and (near or (n.in_formation and flies)):
                 true = self.vehicles[n.vehicle_id].autopilot.truth().position_ned_m
                 error_m = dist(n.position_ned_m, true)
                 place = (error_m / n.uncertainty_m, error_m, n.uncertainty_m)
                 seen[n.vehicle_id] = min(seen.get(n.vehicle_id, place), place)
-        for _, error_m, bound_m in seen.values():
-            self.near_bound.see(error_m, bound_m)
+        for i, (_, error_m, bound_m) in seen.items():
+            (self.near_bound if agent.peers.due_soon(i) else self.bound).see(error_m, bound_m)
 
     def _send(self, i: int, out: Outputs, sender: Agent) -> None:
         """What a companion sends goes on its ways, to its autopilot and to all who hear."""

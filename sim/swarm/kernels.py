@@ -40,7 +40,7 @@ from sim.swarm.compiled import (
 )
 from sim.swarm.exchange import deliver, normal3, predict_all, send, uniform
 from sim.swarm.rows import constrain, sums_over
-from sim.swarm.state import NEVER, Floats, Options, State
+from sim.swarm.state import ERROR_BIN_M, ERROR_BINS, NEVER, Floats, Options, State
 
 
 @kernel
@@ -339,7 +339,7 @@ def move(k: int, s: State, o: Options) -> None:
 
 
 @kernel
-def watch(s: State, o: Options, et: ErrorTrigger) -> None:
+def watch(s: State, o: Options) -> None:
     """Measures that need every step: distances, commands, prediction errors against their bound."""
     n = s.x.shape[0]
     least = s.measures[0] * s.measures[0]
@@ -358,14 +358,11 @@ def watch(s: State, o: Options, et: ErrorTrigger) -> None:
         d = 0.0
         for c in range(3):
             d += (s.x[j, c] - s.predicted[r, c]) ** 2
-        kappa = 0.0 if o.intent == 1 else et.kappa
-        res = s.residual[j, 0] ** 2 + s.residual[j, 1] ** 2 + s.residual[j, 2] ** 2
-        epsilon = math.sqrt(et.epsilon_m * et.epsilon_m + kappa * kappa * res)
-        bound = o.bound_slope * epsilon + o.bound_constant
         error = math.sqrt(d)
+        s.error_bins[min(int(error / ERROR_BIN_M), ERROR_BINS - 1)] += 1
         s.measures[2] += 1.0
-        s.measures[3] += 1.0 if error > bound else 0.0
-        s.measures[4] = max(s.measures[4], error / max(bound, 1e-9))
+        s.measures[3] += 1.0 if error > o.bound_m else 0.0
+        s.measures[4] = max(s.measures[4], error / o.bound_m)
         s.measures[5] += d
         s.measures[6] = max(s.measures[6], error)
 
@@ -393,10 +390,10 @@ def exchange(
 
 
 @kernel
-def fly(k: int, s: State, o: Options, et: ErrorTrigger) -> None:
+def fly(k: int, s: State, o: Options) -> None:
     """Step k after the laws."""
     if k % o.every == 0 and o.dense_measures == 1:
-        watch(s, o, et)
+        watch(s, o)
     move(k, s, o)
 
 
@@ -410,4 +407,4 @@ def advance(
         exchange(k, keep_every, s, ref, o, ig, et, st, it)
         if k % o.every == 0:
             command(k, s, ref, o, g, ig)
-        fly(k, s, o, et)
+        fly(k, s, o)

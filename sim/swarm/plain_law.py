@@ -43,7 +43,7 @@ class PlainLaws:
             exchange(k, keep_every, s, ref, o, ig, et, st, it)
             if k % o.every == 0:
                 self._command(k, s, ref, o)
-            fly(k, s, o, et)
+            fly(k, s, o)
 
     def _command(self, k: int, s: State, ref: Floats, o: Options) -> None:
         for i, law in enumerate(self.laws):

@@ -16,8 +16,11 @@ from companion.config.messages import sentence
 from companion.core.formation import SHAPES
 from companion.core.law.intent import IntentGains, IntentTrigger
 from companion.core.law.starling import Gains
+from companion.core.monitor import PeerMotion
 from companion.core.safety.filter import COLLISION_DISTANCE_M, LAG_ALLOWANCE_M
+from companion.core.trigger import base as rule
 from companion.core.trigger.error import ErrorTrigger
+from companion.core.trigger.periodic import PeriodicTrigger
 from companion.core.trigger.switching import SwitchingTrigger
 from companion.errors import ConfigError
 from sim.swarm.baselines import CUT, GRADIENT, UNCUT
@@ -264,28 +267,28 @@ class Setup:
         return self.links or self.loss > 0 or self.delay_s > 0 or self.digest > 0
 
     @property
-    def latency_s(self) -> float:
-        """L of the error bound: control period, delay and t_min."""
-        return self.control_every * self.dt_s + self.delay_s + self.t_min_s
-
-    def error_bound_m(self) -> tuple[float, float]:
-        """(slope, constant) of the bound on |p_j - p^_j| against the threshold epsilon in force (m).
-
-        As `monitor.prediction_error_bound_m`, plus the send filter's own lag: under a constant unknown acceleration d
-        the filter ends up d/11 behind in position and 2d/11 in velocity.
-        """
-        latency = self.latency_s
-        unknown = 4 * self.gust_m_s2 + (self.a_max_m_s2 if self.lag_s > 0 else 0.0)
-        behind = unknown * (1 + 2 * latency) / 11 if self.send_filter else 0.0
+    def peer_motion(self) -> PeerMotion:
+        """What the agents must reckon with in each other (`core.monitor`)."""
         a_max = self.a_max_m_s2 if math.isfinite(self.a_max_m_s2) else 50.0
-        return (
-            1 + latency / math.sqrt(self.gamma_s2),
-            5.7 * self.sigma_p_m
-            + latency * 5.7 * self.sigma_v_m_s
-            + 0.5 * (2 * a_max + 4 * self.gust_m_s2) * latency**2
-            + behind
-            + 1e-9,
-        )
+        cruise = math.hypot(*self.velocity_m_s) + self.start_velocity_m_s
+        return PeerMotion(
+            sigma_p_m=self.sigma_p_m, sigma_v_m_s=self.sigma_v_m_s,
+            sigma_gust_m_s2=math.hypot(self.gust_m_s2, self.impulse_m_s2), a_max_m_s2=a_max,
+            deviation_m_s2=2.0 * a_max, drift_m_s=cruise if self.hold == "zero" else 0.0, speed_m_s=math.inf,
+            lag_s=self.lag_s if self.send_filter else 0.0, latency_s=self.control_every * self.dt_s + self.delay_s,
+            t_min_s=self.t_min_s, t_max_s=self.t_max_s,
+        )  # fmt: skip
+
+    @property
+    def error_bound_m(self) -> float:
+        """Bound on |p_j - p^_j| while nothing is lost (m): the flown one of the trigger; none of a baseline's."""
+        rules: Mapping[Trigger, rule.Trigger] = {
+            "error": ErrorTrigger(self.epsilon_m, self.gamma_s2, self.kappa),
+            "intent": ErrorTrigger(self.epsilon_m, self.gamma_s2, 0.0),
+            "switching": SwitchingTrigger(self.gamma_s2, self.alpha, self.beta, self.delta_min, self.delta_f, self.eta),
+            "periodic": PeriodicTrigger(self.period_s),
+        }
+        return rules[self.trigger].error_bound_m(self.peer_motion) if self.trigger in rules else math.inf
 
 
 def _check(allowed: bool, name: str, value: object, text: str) -> None:
@@ -361,7 +364,6 @@ def gains(setup: Setup) -> Gains:
 
 def run_options(setup: Setup) -> Options:
     """The set-up as the kernels' plain numbers."""
-    slope, constant = setup.error_bound_m()
     own_held = setup.reading in ("V1", "V1b")
     elastic = setup.trigger == "elastic"
     fault = setup.fault != "none"
@@ -416,8 +418,7 @@ def run_options(setup: Setup) -> Options:
         fault_step=round(setup.fault_time_s / setup.dt_s) if fault else 2**40,
         fault_frozen=round(0.5 / setup.dt_s) if setup.fault == "freeze" else 0,
         presence_delay=setup.presence_delay_s,
-        bound_slope=slope,
-        bound_constant=constant,
+        bound_m=setup.error_bound_m,
         dense_measures=int(setup.dense_measures and setup.formation.count <= DENSE_MAX),
     )
 

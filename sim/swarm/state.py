@@ -89,8 +89,8 @@ class Options(NamedTuple):
     fault_frozen: int
     """steps for which the failing vehicle's measurements stand still before it falls silent"""
     presence_delay: float
-    bound_slope: float
-    bound_constant: float
+    bound_m: float
+    """on the error of every prediction"""
     dense_measures: int
     """1: minimum distance and prediction errors are measured at every step"""
 
@@ -173,6 +173,8 @@ class State(NamedTuple):
     scratch: Floats
     measures: Floats
     """see MEASURES"""
+    error_bins: Ints
+    """how many predictions were wrong by so many ERROR_BIN_M; the last one holds what is larger"""
     events: Ints
     """(most, 2): step, agent"""
     counts: Ints
@@ -181,6 +183,8 @@ class State(NamedTuple):
     """(steps kept, N, 6)"""
 
 
+ERROR_BIN_M = 0.001
+ERROR_BINS = 4000
 MEASURES = (
     "minimum_distance_m",
     "peak_command_m_s2",

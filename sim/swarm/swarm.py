@@ -20,7 +20,7 @@ from companion.core.law.base import FIELDS_MAX
 from companion.errors import ConfigError
 from sim.swarm.neighbour_list import NeighbourList
 from sim.swarm.setup import DENSE_MAX, Setup, connected, rules_of, run_options
-from sim.swarm.state import MEASURES, ROW, SAMPLE, Floats, Ints, State
+from sim.swarm.state import ERROR_BIN_M, ERROR_BINS, MEASURES, ROW, SAMPLE, Floats, Ints, State
 
 
 def kernels() -> ModuleType:
@@ -57,6 +57,8 @@ class Run:
     steps_fixed: int
     """agent-steps in each mode of Eq. (5)"""
     measures: dict[str, float] = field(default_factory=dict)
+    error_bins: Ints = field(default_factory=lambda: np.zeros(ERROR_BINS, dtype=np.int64))
+    """how many predictions were wrong by so many millimetres"""
 
     def healthy(self) -> npt.NDArray[np.bool_]:
         """Agents that did not fail."""
@@ -89,6 +91,12 @@ class Run:
     def per_agent(self) -> Ints:
         """Messages of each agent, shape (N,)."""
         return np.bincount(self.events[:, 1], minlength=self.position_m.shape[1]).astype(np.int64)
+
+
+def quantile_m(error_bins: Ints, share: float) -> float:
+    """The error that this share of all predictions does not exceed (m), to a bin's width."""
+    total = np.cumsum(error_bins)
+    return ERROR_BIN_M * (int(np.searchsorted(total, share * total[-1])) + 1)
 
 
 def reference_table(setup: Setup, steps: int) -> Floats:
@@ -190,7 +198,7 @@ def state_of(
         ring_digest_id=np.full((depth, n if o.links else 1, ring_digest), -1, dtype=np.int64),
         outage=np.zeros(rows, dtype=np.uint8), keys=agent_keys(seed, n),
         **_room(int(np.diff(start).max()) + 1),
-        measures=np.array([1e9, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]),
+        measures=np.array([1e9, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]), error_bins=np.zeros(ERROR_BINS, dtype=np.int64),
         events=np.zeros((n * (steps // setup.control_every + 1), 2), dtype=np.int64),
         counts=np.zeros(4, dtype=np.int64), record=np.zeros((kept, n, 6)),
     )  # fmt: skip
@@ -250,6 +258,7 @@ def run(setup: Setup, seed: int, *, reference: Floats | None = None, start: tupl
         steps_dynamic=int(s.counts[2]),
         steps_fixed=int(s.counts[3]),
         measures=dict(zip(MEASURES, map(float, s.measures), strict=True)),
+        error_bins=s.error_bins,
     )
 
 

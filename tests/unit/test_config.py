@@ -17,6 +17,7 @@ from companion.config.endpoints import autopilot_port, companion_port, serial_en
 from companion.config.file import parse
 from companion.config.overrides import plan_legs, resize
 from companion.core.law.starling import StarlingLaw
+from companion.core.monitor import own_error_m
 from companion.core.safety.fence import Fence
 from companion.core.trajectory.legs import GotoLeg, TurnLeg, VelocityLeg
 from companion.errors import ConfigError
@@ -342,7 +343,7 @@ def in_the_field(first: str) -> Change:
 
 
 ACROSS = [
-    (put("formation.spacing_m", 1.5), "$.formation.spacing_m", "the safety radius 1.49 m", "got 1.50 m"),
+    (put("formation.spacing_m", 1.5), "$.formation.spacing_m", "the safety radius 1.50 m", "got 1.50 m"),
     (put("law.r0_m", 5.0), "$.formation.spacing_m", "separation's range 5.00 m", "got 4.00 m"),
     (put("formation.shape", "star"), "$.formation.shape", "v, line, column, circle, grid, spiral, sphere, custom",
      "got 'star'"),
@@ -359,14 +360,14 @@ ACROSS = [
     (in_the_field("udp/10.0.0.1:7447"), "$.vehicle[0].zenoh", "by UDP a pair that loses a declaration stays deaf",
      "got udp/10.0.0.1:7447: name the address"),
     (put("vehicle.0.slot", 10), "$.vehicle[0].slot", "below the 10 enabled vehicles", "got 10"),
-    (put("launch.spacing_m", 1.0), "$.launch.spacing_m", "at least the safety radius 1.49 m", "got 1.00 m"),
+    (put("launch.spacing_m", 1.0), "$.launch.spacing_m", "at least the safety radius 1.50 m", "got 1.00 m"),
     (put("vehicle.0.pad_m", [-2.0, -7.5]), "$.vehicle[].pad_m", "at least the safety radius", "got"),
     (put("trigger", {"t_min_s": 0.5, "t_max_s": 0.5}), "$.trigger.t_min_s", "below $.trigger.t_max_s = 0.5", "got 0.5"),
     (put("peers.range_m", 0.5), "$.peers.range_m", "must be at least 6.96 m", "got 0.5"),
     (put("peers.range_m", 6.95), "$.peers.range_m", "must be at least 6.96 m", "got 6.95"),
     (put("trigger.t_min_s", 0.11), "$.trigger.t_min_s", "<= $.trigger.near_period_s = 0.1 s", "got 0.11"),
     (periodic(0.04), "$.trigger.period_s", ">= $.trigger.t_min_s = 0.05 s", "got 0.04"),
-    (periodic(60.0), "$.launch.spacing_m", "81.89 m apart (81.24 m of it since a peer is known no better with "
+    (periodic(60.0), "$.launch.spacing_m", "81.67 m apart (81.02 m of it since a peer is known no better with "
      "$.trigger.period_s = 60 s)", "got 4.00"),
     (periodic(0.6), "$.launch.spacing_m", "known no better with $.trigger.period_s = 0.6 s", "got 4.00"),
     (put(f"{VELOCITY}.north_m_s", 3.1), "$.plan.legs[0]", "<= 3 m/s (3/4 of $.limits.speed_max_m_s)", "got 3.1"),
@@ -575,10 +576,19 @@ def test_the_safety_radius_follows_the_trigger() -> None:
     """No kind has a radius by default: a slower period gives a larger one, and what is too large is refused."""
     radii = [parse(changed(periodic(p)), "fleet.toml").safety_radius_m for p in (0.05, 0.1, 0.2, 0.4)]
     assert radii == sorted(radii)
-    assert radii[0] == pytest.approx(0.65 + 0.285 + 0.17 * 0.285 + 0.5 * (8.0 + 4.0 / 0.7 + 1.2) * 0.17**2)
+    motion = parse(default_tables(), "fleet.toml").peer_motion
+    age_s = 0.05 + 0.02 + 0.05  # its period, the control period, the delay
+    assert radii[0] == pytest.approx(0.65 + own_error_m(age_s, motion) + 0.5 * (8.0 + 4.0 / 0.7) * age_s**2)
     assert radii[-1] > 2 * radii[0]
-    late = parse(changed(put("trigger.t_min_s", 0.1)), "fleet.toml")
+    late = parse(changed(put("limits.control_rate_hz", 20.0)), "fleet.toml")
     assert late.safety_radius_m > parse(default_tables(), "fleet.toml").safety_radius_m
+
+
+def test_what_was_accepted_by_the_shipped_values_is_accepted() -> None:
+    """Pads 1.5 m and slots 1.70 m apart, to the centimetre."""
+    config = parse(changed(put("launch.spacing_m", 1.5), put("formation.spacing_m", 1.7)), "fleet.toml")
+    assert config.safety_radius_m > 1.49
+    assert config.spacing_min_m > 1.69
 
 
 @pytest.mark.parametrize("hold", ["damped", "zero", "first"])

@@ -26,9 +26,9 @@ from companion.core.values import ZERO, Neighbour, VehicleState
 
 MOTION = PeerMotion(
     sigma_p_m=0.05, sigma_v_m_s=0.05, sigma_gust_m_s2=0.3, a_max_m_s2=5.0, deviation_m_s2=13.7, drift_m_s=0.0,
-    speed_m_s=8.0, latency_s=0.12, t_max_s=10.0,
+    speed_m_s=8.0, lag_s=0.15, latency_s=0.07, t_min_s=0.05, t_max_s=10.0,
 )  # fmt: skip
-BOUND_M = 0.84
+BOUND_M = 0.849
 TICK_NS = 20_000_000
 HOLD_NS = 1_000_000_000
 
@@ -213,8 +213,8 @@ def test_the_bound_of_a_near_peer_is_the_triggers_until_its_sample_is_old(age_s:
     assert bound == pytest.approx(min(max(BOUND_M, unheard_error_m(age_s, MOTION)), BOUND_M + 1.0))
 
 
-def test_two_periods_without_a_message_are_covered_by_the_triggers_bound() -> None:
-    assert missing_m(0.2, BOUND_M, MOTION) == 0.0
+def test_a_message_that_comes_when_it_is_due_is_covered_by_the_triggers_bound() -> None:
+    assert missing_m(0.1 + MOTION.latency_s, BOUND_M, MOTION) == 0.0
     assert missing_m(0.3, BOUND_M, MOTION) > 0.1
 
 

@@ -34,7 +34,7 @@ START_NS = 1_790_000_000_000_000_000
 ZERO = Ned(0.0, 0.0, 0.0)
 MOTION = PeerMotion(
     sigma_p_m=0.01, sigma_v_m_s=0.01, sigma_gust_m_s2=0.0, a_max_m_s2=5.0, deviation_m_s2=12.0, drift_m_s=0.0,
-    speed_m_s=8.0, latency_s=0.1, t_max_s=5.0,
+    speed_m_s=8.0, lag_s=0.0, latency_s=0.1, t_min_s=0.05, t_max_s=5.0,
 )  # fmt: skip
 LIMITS = PeerLimits(
     hold="damped", hold_damping_s=0.7, range_m=100.0, stale_after_s=12.0, heartbeat_s=5.7, isolated_flight_s=5.0,

@@ -214,7 +214,7 @@ def test_vehicles_must_stand_apart_by_the_safety_radius(gap_m: float, fit: bool)
     a, b = CONFIG.by_id(1), CONFIG.by_id(2)
     apart = b.pad_east_m - a.pad_east_m
     faults = report({2: shifted(2, east=CONFIG.safety_radius_m + gap_m - apart)}).faults
-    assert not faults if fit else faults[0].startswith("vehicle 1 and 2 stand 1.48 m apart; must be 1.49 m")
+    assert not faults if fit else faults[0].startswith("vehicle 1 and 2 stand 1.49 m apart; must be 1.50 m")
 
 
 @pytest.mark.parametrize(("beyond_m", "fit"), [(-0.01, True), (0.0, True), (0.01, False)])
@@ -266,7 +266,7 @@ def test_pinned_slots_that_make_vehicles_fly_head_on_are_refused() -> None:
 
     of = load(FILE, change)
     (said,) = report(of=of).faults
-    assert said.startswith("vehicle 1 and 2 come within 0.00 m on their ways to 'line'; must be 1.49 m")
+    assert said.startswith("vehicle 1 and 2 come within 0.00 m on their ways to 'line'; must be 1.50 m")
 
 
 def test_once_the_fleet_has_formed_its_first_change_is_no_matter() -> None:

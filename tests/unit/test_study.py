@@ -23,7 +23,7 @@ from sim.study.common import load_config, measured, parse_seeds, proportion_inte
 from sim.study.faults import _ablated
 from sim.study.run import study
 from sim.study.scale import step_costs
-from sim.study.theory import lyapunov, shortest_interval_s
+from sim.study.theory import SETTLED_S, lyapunov, settled_f_m, shortest_interval_s, ultimate_bound
 from sim.swarm.swarm import run
 
 
@@ -135,6 +135,40 @@ def test_proof_fails_for_the_common_mode_and_intervals_respect_their_bound() -> 
     assert v["disagreement"][-1] < 0.01 * v["c1_side"][-1]
     assert (v["v3"] >= 0).all()
     assert flown.intervals_s().min() >= shortest_interval_s(flown)
+
+
+def test_the_bound_on_the_shape_is_the_closed_form_where_everyone_hears_everyone() -> None:
+    """s^2 + (k_a (n + 1)/n + k_v) s + k_c (n + 1)/n does not swing, and a held neighbour's error is divided by n."""
+    config = load_config("theory")
+    setup = replace(config.one("flown"), k_a=3.0, k_c=4.0, k_v=1.0, k_p=0.3, gamma_s2=0.1)
+    found, n = ultimate_bound(setup), 9
+    stiffness = 4.0 * (n + 1) / n
+    assert found["lambda2"] == pytest.approx(n + 1)
+    assert found["gain_gust_s2"] == pytest.approx(1.0 / stiffness, rel=1e-3)
+    held = np.hypot(4.0 - 0.3 * n / (n + 1), 3.0 / np.sqrt(0.1)) / n
+    assert found["gain_held"] == pytest.approx(held / stiffness, rel=1e-3)
+
+
+def test_the_bound_on_the_shape_grows_with_threshold_and_gusts_and_as_the_graph_thins() -> None:
+    config = load_config("theory")
+    base = config.on(config.one("flown"), "ultimate")["N = 12, ring of 4 neighbours"]
+    bound = ultimate_bound(base)["bound_m"]
+    assert ultimate_bound(replace(base, epsilon_m=0.3))["bound_m"] > bound
+    assert ultimate_bound(replace(base, gust_m_s2=0.4))["bound_m"] > bound
+    assert (
+        ultimate_bound(replace(base, range_m=2.2))["bound_m"]
+        > bound
+        > ultimate_bound(replace(base, range_m=9.0))["bound_m"]
+    )
+
+
+@pytest.mark.parametrize("case", ["N = 10, all hear all", "N = 10, calm", "leaderless, N = 10, all hear all"])
+def test_the_formation_stays_within_the_bound_on_its_shape(case: str) -> None:
+    config = load_config("theory")
+    setup = config.on(replace(config.one("flown"), links=False), "ultimate")[case]
+    f = settled_f_m(run(setup, 200))
+    assert len(f) > SETTLED_S
+    assert f.max() <= ultimate_bound(setup)["bound_m"]
 
 
 def test_the_cost_of_a_step_grows_as_the_number_of_agents_and_not_as_its_square() -> None:

@@ -17,7 +17,7 @@ SWITCHING = SwitchingTrigger(gamma_s2=0.5, alpha=0.75, beta=0.5, delta_min=0.25,
 
 MOTION = PeerMotion(
     sigma_p_m=0.0, sigma_v_m_s=0.0, sigma_gust_m_s2=0.0, a_max_m_s2=5.0, deviation_m_s2=12.0, drift_m_s=0.0,
-    speed_m_s=8.0, latency_s=0.1, t_max_s=10.0,
+    speed_m_s=8.0, lag_s=0.0, latency_s=0.1, t_min_s=0.05, t_max_s=10.0,
 )  # fmt: skip
 
 

@@ -26,7 +26,8 @@ class ErrorTrigger(NamedTuple):
 
     def error_bound_m(self, motion: PeerMotion) -> float:
         """The raised threshold, and what the latency adds."""
-        return prediction_error_bound_m(hypot(self.epsilon_m, RAISED_MAX_M), self.gamma_s2, motion)
+        raised_m = RAISED_MAX_M if self.kappa > 0.0 else 0.0
+        return prediction_error_bound_m(hypot(self.epsilon_m, raised_m), self.gamma_s2, motion)
 
     @property
     def waits(self) -> bool:

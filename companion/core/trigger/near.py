@@ -93,7 +93,7 @@ def missing_m(age_s: float, bound_m: float, motion: PeerMotion) -> float:
     """What missing messages add to the bound `bound_m` on a near peer's prediction, by its latest sample's age (m).
 
     The sample's own age counts, whatever way it came, so that delay widens the bound as loss does. It grows from zero
-    on, about a quarter of a second old, at the rate of d/dt (deviation age^2/2): no command jumps.
+    on, about a fifth of a second old, at the rate of d/dt (deviation age^2/2): no command jumps.
     """
     return min(max(unheard_error_m(age_s, motion) - bound_m, 0.0), MISSING_MAX_M)
 
@@ -101,9 +101,9 @@ def missing_m(age_s: float, bound_m: float, motion: PeerMotion) -> float:
 def near_bound_m(age_s: float, bound_m: float, motion: PeerMotion) -> float:
     """How far a peer in near mode is from its prediction at most, lost messages included, by its sample's age (m).
 
-    `bound_m` is the trigger's own bound while nothing is lost. With A = deviation + 4 sigma_gust it is
+    `bound_m` is the trigger's own bound while nothing is lost. It is
 
-        max(bound, 5.7 sigma_p + (drift + 5.7 sigma_v) age + A age^2 / 2),   no more than bound + MISSING_MAX_M
+        max(bound, `unheard_error_m` of that age),   no more than bound + MISSING_MAX_M
 
     The first line holds whatever is lost, since it asks nothing of the messages but their age. The cap ends that: a
     peer silent for longer (`certain_age_s`) may be farther away than this says, and is kept at the cap's distance.
