@@ -9,7 +9,7 @@ import os
 import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from hashlib import blake2s
 from multiprocessing import get_context
 from pathlib import Path
@@ -30,7 +30,7 @@ Floats = npt.NDArray[np.float64]
 Record = dict[str, Any]
 """values that JSON can hold"""
 
-STUDIES = ("example1", "example2", "table3", "readings", "pareto", "faults", "scale", "theory")
+STUDIES = ("example1", "example2", "table3", "readings", "pareto", "worth", "faults", "scale", "theory")
 FLOWN_STUDIES = ("headon", "messages", "campaign")
 """studies that fly the real agents in lockstep: minutes to hours, so `all` leaves them out"""
 FLYING_CODE = tuple(
@@ -350,25 +350,33 @@ def measured(run: Run, after_s: float = 8.0) -> Record:
     }
 
 
+def same_number(setup: Setup, messages: int) -> Setup:
+    """A periodic set-up with the period at which all send so many messages, each one's first included."""
+    n = setup.formation.count
+    return replace(setup, period_s=n * setup.duration_s / max(messages - n, 0.5))
+
+
 def statistics(values: Sequence[float]) -> Record:
-    """Mean, spread (sample standard deviation), median and range over seeds."""
+    """Mean, spread (sample standard deviation), median, quartiles and range over seeds."""
     a = np.asarray(values, dtype=float)
     return {
         "mean": float(a.mean()),
         "sd": float(a.std(ddof=1)) if a.size > 1 else 0.0,
         "median": float(np.median(a)),
+        "q1": float(np.percentile(a, 25)),
+        "q3": float(np.percentile(a, 75)),
         "min": float(a.min()),
         "max": float(a.max()),
     }
 
 
 def over_seeds(records: Sequence[Record], keys: Iterable[str]) -> Record:
-    """Mean of each key under its own name, spread under NAME_sd, range under NAME_min and NAME_max."""
+    """Mean of each key under its own name; spread, median, quartiles and range under NAME_sd, NAME_median and so on."""
     row: Record = {}
     for key in keys:
         s = statistics([r[key] for r in records])
-        row |= {key: s["mean"], f"{key}_sd": s["sd"], f"{key}_median": s["median"], f"{key}_min": s["min"],
-                f"{key}_max": s["max"]}  # fmt: skip
+        row[key] = s.pop("mean")
+        row |= {f"{key}_{name}": value for name, value in s.items()}
     return row
 
 

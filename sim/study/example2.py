@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sim.study.common import Column, Config, Figure, Outcome, Record, Table
-from sim.study.figures import BLUE, RED, panels, snapshots, trajectories_3d
+from sim.study.figures import RED, SKY, panels, snapshots, trajectories_3d
 from sim.study.paper import at, error_curves, example_record, first_run, per_axis_rms_m
 from sim.swarm.swarm import run
 
@@ -88,13 +88,15 @@ def finish(config: Config, pieces: Sequence[Record], seeds: Sequence[int]) -> Ou
     ax = axes[0, 0]
     number = np.arange(1, 11)
     counts = np.array([p[next(iter(p))]["counts"] for p in pieces])
+    low, middle, high = np.percentile(counts, (25, 50, 75), axis=0)
     ax.bar(
-        number, counts.mean(axis=0), yerr=counts.std(axis=0), color=BLUE, width=0.6, capsize=3, label="ours, ± 1 s.d."
-    )
+        number, middle, yerr=[middle - low, high - middle], color=SKY, width=0.6, capsize=3,
+        label="ours, median and interquartile range",
+    )  # fmt: skip
     levels = np.where(np.isin(number, (1, 6)), published["count_tips"], published["count_rest"])
     ax.scatter(number, levels, color=RED, marker="_", s=300, lw=2, label="published, about", zorder=3)
     ax.set(
-        xlabel="UAV", ylabel="messages in 20 s", title="Example 2: event triggers per UAV", xticks=number, ylim=(0, 290)
+        xlabel="UAV", ylabel="messages in 20 s", title="Example 2: event triggers per UAV", xticks=number, ylim=(0, 320)
     )
     ax.legend(ncols=2, loc="upper center")
     outcome.figures.append(

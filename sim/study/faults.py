@@ -4,8 +4,19 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sim.study.common import Column, Config, Figure, Outcome, Record, Table, measured, over_seeds, proportion_text
-from sim.study.figures import BLUE, GREEN, GREY, RED, panels
+from sim.study.common import (
+    Column,
+    Config,
+    Figure,
+    Outcome,
+    Record,
+    Table,
+    measured,
+    over_seeds,
+    proportion_interval,
+    proportion_text,
+)
+from sim.study.figures import BLUE, FAMILY, RED, SKY, panels, quartiles
 from sim.swarm.setup import Setup, setup_from
 from sim.swarm.swarm import Run, run
 
@@ -132,40 +143,41 @@ def finish(config: Config, pieces: Sequence[Record], seeds: Sequence[int]) -> Ou
         "predictions were off by more than the safety radius, and 9 of these 20 seeds came below.",
         "Messages under noise of 0.1 m and more rise above 1 %: the threshold is then near the sensors' own error.",
     ]
-    fig, axes = panels(1, 2, 7.4, 5.0, sharey=True)
+    fig, axes = panels(1, 2, 7.4, 5.4, sharey=True)
     y = np.arange(len(rows))[::-1]
-    for law, colour, shift in (("flown", BLUE, 0.15), ("intent", GREEN, -0.15)):
-        axes[0, 0].errorbar(
-            [r[f"{law}_f_m_median"] for r in rows], y + shift,
-            xerr=[[max(r[f"{law}_f_m_median"] - r[f"{law}_f_m_min"], 0) for r in rows],
-                  [r[f"{law}_f_m_max"] - r[f"{law}_f_m_median"] for r in rows]],
-            fmt="o", ms=4, color=colour, label={"flown": "flown law", "intent": "published intent"}[law], lw=1,
-        )  # fmt: skip
-        axes[0, 1].errorbar(
-            [r[f"{law}_minimum_distance_m_median"] for r in rows], y + shift,
-            xerr=[[r[f"{law}_minimum_distance_m_median"] - r[f"{law}_minimum_distance_m_min"] for r in rows],
-                  [r[f"{law}_minimum_distance_m_max"] - r[f"{law}_minimum_distance_m_median"] for r in rows]],
-            fmt="o", ms=4, color=colour, lw=1,
-        )  # fmt: skip
-    axes[0, 1].axvline(CLOSE_M, color=RED, ls="--", lw=1)
+    for law, label, look, shift in (
+        ("flown", "flown law", FAMILY[0], 0.15), ("intent", "published intent", FAMILY[2], -0.15)
+    ):  # fmt: skip
+        for ax, key, worst in ((axes[0, 0], "f_m", "max"), (axes[0, 1], "minimum_distance_m", "min")):
+            middle, bars = quartiles(rows, f"{law}_{key}")
+            ax.errorbar(middle, y + shift, xerr=bars, fmt=look[1], ms=4, lw=1, capsize=1.5, color=look[0], label=label)
+            ax.scatter([r[f"{law}_{key}_{worst}"] for r in rows], y + shift, marker="|", s=30, color=look[0],
+                       label=f"{label}, worst seed")  # fmt: skip
+    axes[0, 1].axvline(CLOSE_M, color=RED, ls="--", lw=1, label=f"{CLOSE_M} m: collision")
     axes[0, 0].set_yticks(y, [r["fault"] for r in rows])
     axes[0, 0].set(xscale="log", xlabel="F (m)", title="formation error")
     axes[0, 1].set(xlabel="minimum distance (m)", title="distance", xlim=(0, None))
-    axes[0, 0].legend(loc="lower left", fontsize=7)
+    fig.legend(*axes[0, 1].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     outcome.figures.append(
-        Figure("faults", "Median and range over seeds of F and of the minimum distance; 0.5 m is a collision.", fig)
+        Figure("faults", "Median, interquartile range and worst of the seeds, of F and of the minimum distance.", fig)
     )
     fig, axes = panels(1, 1, 7.2, 3.4)
     ax = axes[0, 0]
     y = np.arange(len(ablation))[::-1]
+    share = np.array([100 * r["close_share"] for r in ablation])
+    ends = np.array([proportion_interval(round(r["close_share"] * n), n) for r in ablation]) * 100
     ax.barh(
-        y,
-        [100 * r["close_share"] for r in ablation],
-        color=[GREY if r["case"] != "with everything" else BLUE for r in ablation],
-    )
+        y, share, xerr=[share - ends[:, 0], ends[:, 1] - share], capsize=2,
+        color=[SKY if r["case"] != "with everything" else BLUE for r in ablation],
+    )  # fmt: skip
     ax.set_yticks(y, [r["case"] for r in ablation])
     ax.set(xlabel=f"seeds below {CLOSE_M} m (%)", title="exchanged slots, everything at once", xlim=(0, 100))
     outcome.figures.append(
-        Figure("faults_ablation", "Share of seeds with a distance below 0.5 m without each safeguard.", fig)
+        Figure(
+            "faults_ablation",
+            "Share of seeds with a distance below 0.5 m without each safeguard, with its 95 % "
+            "interval; dark: with all of them.",
+            fig,
+        )
     )
     return outcome

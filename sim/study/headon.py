@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from itertools import product
 from math import dist
 from random import Random
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from sim.lockstep.lockstep import Lockstep
 from sim.lockstep.network import NetworkParameters
 from sim.study.broken_law import BrokenLaw
 from sim.study.common import FLYING_CODE, Column, Config, Figure, Outcome, Record, Table, proportion_text, table_of
-from sim.study.figures import BLUE, GREEN, GREY, RED, panels
+from sim.study.figures import FAMILY, INK, panels, quartiles
 from sim.study.never_near import NeverNear
 
 TITLE = "Head-on by a broken law: lag, delay and loss"
@@ -136,6 +136,9 @@ def _row(records: Sequence[Record]) -> Record:
     distances = [r["minimum_distance_m"] for r in records]
     return {
         "median_m": float(np.median(distances)),
+        "minimum_distance_m_median": float(np.median(distances)),
+        "minimum_distance_m_q1": float(np.percentile(distances, 25)),
+        "minimum_distance_m_q3": float(np.percentile(distances, 75)),
         "least_m": min(distances),
         "close": proportion_text(sum(d < COLLISION_M for d in distances), len(distances)),
         "bound_exceeded": f"{sum(r['bound_exceeded'] for r in records)} of {sum(r['bound_looks'] for r in records)}",
@@ -222,17 +225,22 @@ def _finding(rows: Sequence[Record], seeds: int) -> str:
 
 
 def _figure(meeting: Meeting, rows: Sequence[Record]) -> Figure:
-    fig, axes = panels(1, len(meeting.lags_s), 7.4, 3.0, sharey=True)
-    colours: list[Any] = [BLUE, GREEN, GREY]
+    fig, axes = panels(1, len(meeting.lags_s), 7.4, 3.4, sharey=True)
     for ax, lag in zip(axes[0], meeting.lags_s, strict=True):
         for k, loss in enumerate(meeting.losses):
             mine = [r for r in rows if r["lag_s"] == lag and r["loss_percent"] == 100 * loss]
-            ax.plot(
-                [r["delay_ms"] for r in mine], [r["least_m"] for r in mine], "o-", ms=4, lw=1,
-                color=colours[k % len(colours)], label=f"{100 * loss:g} % loss",
-            )  # fmt: skip
-        ax.axhline(COLLISION_M, color=RED, ls="--", lw=1)
+            colour, marker = FAMILY[k]
+            # side by side, so that no bar hides another
+            x = np.array([r["delay_ms"] for r in mine]) + 8.0 * (k - 0.5 * (len(meeting.losses) - 1))
+            middle, bars = quartiles(mine, "minimum_distance_m")
+            ax.errorbar(x, middle, bars, fmt=marker + "-", ms=4, lw=1, capsize=1.5, color=colour,
+                        label=f"{100 * loss:g} % loss")  # fmt: skip
+            ax.plot(x, [r["least_m"] for r in mine], ":", marker=marker, ms=3, mfc="none", lw=1, color=colour,
+                    label=f"{100 * loss:g} % loss, worst seed")  # fmt: skip
+        ax.axhline(COLLISION_M, color=INK, ls="--", lw=1, label=f"{COLLISION_M} m: collision")
         ax.set(xlabel="delay (ms)", title=f"lag {lag:g} s", ylim=(0, None))
-    axes[0, 0].set_ylabel("least distance of all seeds (m)")
-    axes[0, -1].legend(loc="upper right", fontsize=7)
-    return Figure("headon", "Least distance of two vehicles sent at each other; 0.5 m is a collision.", fig)
+    axes[0, 0].set_ylabel("least distance (m)")
+    fig.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    return Figure(
+        "headon", "Least distance of two vehicles sent at each other: median, interquartile range and worst seed.", fig
+    )

@@ -3,8 +3,10 @@
 from collections.abc import Sequence
 from typing import Any
 
-from sim.study.common import Column, Config, Figure, Outcome, Record, Table, measured, over_seeds
-from sim.study.figures import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, panels
+import numpy as np
+
+from sim.study.common import Column, Config, Figure, Outcome, Record, Table, measured, over_seeds, same_number
+from sim.study.figures import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, RED, SKY, panels, quartiles
 from sim.swarm.swarm import run
 
 TITLE = "Messages against error: ours, 20 Hz, and everything between"
@@ -17,18 +19,21 @@ SWEEP_EVERY = 4
 """the schemes that are not judged fly every fourth seed only"""
 RAW = "20 Hz, raw state"
 JUDGED = ("20 Hz", "flown law", "published intent")
+NULLS = ("heartbeats only", "nothing received", "periodic, same number", "periodic 1 Hz")
+"""what the flown law's messages must be held against; the third has as many"""
 
 
 def piece(config: Config, seed: int) -> Record:
     """Every scheme in every scenario under one seed."""
     found: Record = {}
     for scenario, setup in config.cases().items():
-        schemes = config.on(setup, "schemes")
+        schemes = config.on(setup, "schemes") | config.on(setup, "nulls")
         if setup.plan and seed % SWEEP_EVERY == 0:
             schemes |= config.on(setup, "sweep")
         found[scenario] = {}
         for name, changed in schemes.items():
-            record = measured(run(changed, seed))
+            spoken = same_number(changed, found[scenario]["flown law"]["messages"]) if name == NULLS[2] else changed
+            record = measured(run(spoken, seed))
             found[scenario][name] = {k: record[k] for k in KEYS}
     return found
 
@@ -49,6 +54,7 @@ def finish(config: Config, pieces: Sequence[Record], seeds: Sequence[int]) -> Ou
         noise_free = not (setup.gust_m_s2 or setup.sigma_p_m or setup.sigma_v_m_s)
         row: Record = {"scenario": scenario, "f_20hz_m": hertz["f_m"], "f_20hz_sd": hertz["f_m_sd"]}
         row["f_20hz_raw_m"] = summary[scenario][RAW]["f_m"]
+        row |= {f"f_null_{k}_m": summary[scenario][name]["f_m"] for k, name in enumerate(NULLS)}
         for label, r in (("flown", flown), ("intent", intent)):
             bar = 0.01 if noise_free else 1.02 * hertz["f_m"]
             row |= {
@@ -68,7 +74,9 @@ def finish(config: Config, pieces: Sequence[Record], seeds: Sequence[int]) -> Ou
              Column("f_20hz_raw_m", "F at 20 Hz sending raw states (m)", 4),
              Column("flown_fewer_percent", "flown law: fewer messages (%)", 2),
              Column("flown_fewer_least_percent", "worst seed", 2), Column("flown_f_m", "F (m)", 4),
-             Column("flown_f_sd", "±", 4), Column("flown_bytes_fewer_percent", "fewer bytes (%)", 1),
+             Column("flown_f_sd", "±", 4),
+             *(Column(f"f_null_{k}_m", f"F: {name} (m)", 4) for k, name in enumerate(NULLS)),
+             Column("flown_bytes_fewer_percent", "fewer bytes (%)", 1),
              Column("flown_reaches", "≥ 99 % at that F"),
              Column("intent_fewer_percent", "intent: fewer messages (%)", 2),
              Column("intent_fewer_least_percent", "worst seed", 2), Column("intent_f_m", "F (m)", 4),
@@ -91,13 +99,14 @@ def finish(config: Config, pieces: Sequence[Record], seeds: Sequence[int]) -> Ou
              Column("speed_end_m_s", "speed at the end (m/s)"),
              Column("minimum_distance_m", "minimum distance (m)", 2)),
             every,
-            "The judged three fly every seed, the others every fourth.",
+            "20 Hz, flown law, published intent and the null models fly every seed, the others every fourth. Of what "
+            "is sent under “nothing received” none arrives.",
         )
     )  # fmt: skip
     _leaderless(config, summary, outcome)
     outcome.findings += _findings(judged)
     outcome.figures.append(
-        Figure("pareto", "Messages per vehicle and second against F; the dashed line is 1.02 F of 20 Hz.",
+        Figure("pareto", "Messages per vehicle and second against F: median and interquartile range over seeds.",
                _figure(config, summary))
     )  # fmt: skip
     return outcome
@@ -117,8 +126,7 @@ def _findings(judged: Sequence[Record]) -> list[str]:
         "mean by 1/N "
         "with nothing that would gate it yet.",
         _against_raw(judged),
-        "With a shared absolute plan, shape alone would need no messages: they buy agreement without a common anchor, "
-        "separation and membership. The leaderless row is the claim that does not rest on a plan.",
+        _against_nulls(judged),
         "Fewer messages are not proportionally fewer bytes: a digest makes each message longer.",
     ]
 
@@ -132,6 +140,19 @@ def _against_raw(judged: Sequence[Record]) -> str:
         f"{worst['flown_f_m'] / worst['f_20hz_raw_m']:.2f} times its ({worst['scenario']}). Hearing the "
         "others' true states "
         "makes the shape stiffer by N/(N - 1), which rare messages cannot; under noise and loss little of it is left."
+    )
+
+
+def _against_nulls(judged: Sequence[Record]) -> str:
+    """Where F is no larger with less than the flown law's messages."""
+    said = []
+    for k, name in enumerate(NULLS[:3]):
+        alike = [r["scenario"] for r in judged if r[f"f_null_{k}_m"] <= max(1.02 * r["flown_f_m"], 0.01)]
+        said.append(f"{name}: {len(alike)} of {len(judged)}")
+    return (
+        "F judges no trigger where all share a plan: it is within 2 % of the flown law's, or below 0.01 m, with "
+        + ", ".join(said)
+        + " scenarios. What the messages buy instead is in the study worth."
     )
 
 
@@ -156,31 +177,40 @@ def _leaderless(config: Config, summary: dict[str, dict[str, Record]], outcome: 
     outcome.values["leaderless"] = rows
 
 
-def _colour(name: str) -> str:
-    for part, colour in (
-        ("Eq. (2)", PURPLE), ("20 Hz", RED), ("periodic", RED), ("intent", GREEN), ("flown", BLUE), ("damped", BLUE),
-        ("first", ORANGE), ("zero", GREY),
-    ):  # fmt: skip
-        if part in name:
-            return colour
-    return GREY
+FAMILIES = (
+    ("Eq. (2)", PURPLE, "X"), ("nothing", INK, "x"), ("heartbeats", INK, "+"), ("same number", SKY, "<"),
+    ("raw", RED, "v"), ("Hz", RED, "o"), ("intent", GREEN, "s"), ("flown", BLUE, "D"), ("damped", BLUE, "o"),
+    ("first", ORANGE, "^"), ("zero", GREY, "P"),
+)  # fmt: skip
+"""part of a scheme's name, and how the figure shows it"""
+SHOWN_AS = {
+    "Eq. (2)": "Eq. (2), zero order", "nothing": "nothing received", "heartbeats": "heartbeats only",
+    "same number": "periodic, same number", "raw": "20 Hz, raw state", "Hz": "periodic", "intent": "published intent",
+    "flown": "flown law", "damped": "damped hold, other ε", "first": "first-order hold", "zero": "zero-order hold",
+}  # fmt: skip
 
 
 def _figure(config: Config, summary: dict[str, dict[str, Record]]) -> Any:
-    fig, axes = panels(3, 3, 7.6, 7.4)
+    fig, axes = panels(3, 3, 7.6, 8.0)
     for ax, (scenario, schemes) in zip(axes.flat, summary.items(), strict=False):
         setup = config.cases()[scenario]
         seconds = setup.formation.count * setup.duration_s
-        seen: set[str] = set()
-        for name, r in schemes.items():
-            family = "intent" if "intent" in name else "periodic" if "Hz" in name else name.split(",")[0]
-            family = {"flown law": "damped"}.get(family, family)
-            ax.scatter(r["messages"] / seconds, max(r["f_m"], 5e-5), s=42 if name in JUDGED else 16,
-                       marker="D" if name in JUDGED else "o", color=_colour(name),
-                       label=None if family in seen else family)  # fmt: skip
-            seen.add(family)
-        ax.axhline(1.02 * max(schemes["20 Hz"]["f_m"], 0.0098), color=GREY, ls="--", lw=0.8)
-        ax.axvline(0.2, color=GREY, ls=":", lw=0.8)
+        for part, colour, marker in FAMILIES:
+            rows = [r for name, r in schemes.items() if next(p for p, _, _ in FAMILIES if p in name) == part]
+            if not rows:
+                continue
+            x, x_bars = quartiles(rows, "messages")
+            y, y_bars = quartiles(rows, "f_m")
+            if part == "nothing":
+                # none of what it sends arrives: it stands at the left edge
+                x, x_bars = np.full(len(x), 0.055 * seconds), np.zeros_like(x_bars)
+            bottom = np.maximum(y, 5e-5)
+            bars = np.stack([np.minimum(y_bars[0], bottom - 3e-5), y_bars[1]])
+            ax.errorbar(x / seconds, bottom, bars, x_bars / seconds, fmt=marker, ms=4, lw=0.8, color=colour,
+                        label=SHOWN_AS[part])  # fmt: skip
+        ax.axhline(1.02 * max(schemes["20 Hz"]["f_m"], 0.0098), color=GREY, ls="--", lw=0.8,
+                   label="1.02 F of 20 Hz, or 0.01 m")  # fmt: skip
+        ax.axvline(0.2, color=GREY, ls=":", lw=0.8, label="99 % fewer than 20 Hz")
         calm = schemes["20 Hz"]["f_m"] < 0.01
         ax.set(xscale="log", yscale="log", ylim=(3e-5, 0.3) if calm else (0.03, 1.0), xlim=(0.05, 150))
         ax.set_title(scenario, fontsize=8.5)
@@ -188,6 +218,8 @@ def _figure(config: Config, summary: dict[str, dict[str, Record]]) -> Any:
         ax.set_xlabel("messages per vehicle and s")
     for ax in axes[:, 0]:
         ax.set_ylabel("F (m)")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    fig.legend(handles, labels, loc="outside lower center", ncols=4)
+    handles: dict[str, Any] = {}
+    for ax in axes.flat:
+        handles |= dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True))
+    fig.legend(handles.values(), handles, loc="outside lower center", ncols=4)
     return fig

@@ -90,21 +90,23 @@ def finish(config: Config, pieces: Sequence[Record], seeds: Sequence[int]) -> Ou
         "Only the repulsive reading A leaves a formation with spacings beyond r0 unbiased; not cut, phi_s draws the V "
         "together; with the printed sign vehicles fall into each other.",
     ]
-    fig, axes = panels(1, 2, 7.2, 3.2, sharey=True)
+    fig, axes = panels(1, 2, 7.2, 3.6, sharey=True)
     for k, (name, setup) in enumerate(_cases(config, "own").items()):
         flight = run(setup, seeds[0])
         axes[0, 0].plot(flight.time_s, np.linalg.norm(flight.velocity_m_s.mean(axis=1), axis=1), color=CYCLE[k],
-                        label=name.split(":")[0], ls="--" if "V1b," in name else "-",
-                        lw=3.0 if name.startswith(("V0", "V1:")) else 1.2)  # fmt: skip
+                        label=name.split(":")[0], ls=("-", "--", "-.", ":")[k % 4],
+                        lw=2.4 if name.startswith(("V0", "V1:")) else 1.2)  # fmt: skip
     for k, (name, setup) in enumerate(_cases(config, "holds").items()):
         flight = run(setup, seeds[0])
         axes[0, 1].plot(flight.time_s, np.linalg.norm(flight.velocity_m_s.mean(axis=1), axis=1), color=CYCLE[k],
-                        label=name.split("(")[0].split(",")[0])  # fmt: skip
+                        ls=("-", "--", "-.", ":")[k % 4], label=name.split("(")[0].split(",")[0])  # fmt: skip
     axes[0, 0].set(xlabel="time (s)", ylabel="mean speed (m/s)", title="whose state, zero-order hold", ylim=(0, 1.0))
     axes[0, 1].set(xlabel="time (s)", title="what is held, own state true")
     for ax in axes.flat:
-        ax.legend(fontsize=7, loc="lower left" if ax is axes[0, 1] else "center right")
+        ax.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2)
     outcome.figures.append(
-        Figure("readings_braking", "Mean speed under each reading of Eq. (2): 0.8 m/s at the start.", fig)
+        Figure(
+            "readings_braking", f"Mean speed under each reading of Eq. (2), seed {seeds[0]}: 0.8 m/s at the start.", fig
+        )
     )
     return outcome

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from sim.study.common import Column, Config, Figure, Outcome, Record, Table, statistics
-from sim.study.figures import BLUE, GREEN, GREY, RED, panels
+from sim.study.figures import FAMILY, GREY, RED, panels, quartiles
 from sim.swarm.neighbour_list import NeighbourList
 from sim.swarm.setup import Setup, rules_of, run_options
 from sim.swarm.swarm import kernels, reference_table, run, starts, state_of, with_list
@@ -110,15 +110,19 @@ def finish(config: Config, pieces: Sequence[Record], seeds: Sequence[int]) -> Ou
     cost: list[Record] = []
     for k in range(len(pieces[0]["cost"])):
         rows = [p["cost"][k] for p in pieces]
-        cost.append({"count": rows[0]["count"], **{key: statistics([r[key] for r in rows])["median"]
-                     for key in rows[0] if key != "count"}})  # fmt: skip
+        spread = {key: statistics([r[key] for r in rows]) for key in rows[0] if key != "count"}
+        cost.append({
+            "count": rows[0]["count"], **{key: s["median"] for key, s in spread.items()},
+            **{f"{key}_{q}": s[q] for key, s in spread.items() for q in ("median", "q1", "q3")},
+        })  # fmt: skip
     formed: list[Record] = []
     for k in range(len(pieces[0]["formed"])):
         rows = [p["formed"][k] for p in pieces]
         row: Record = {"count": rows[0]["count"]}
         for key in rows[0]:
             values = [r[key] for r in rows if r[key] is not None]
-            row[key] = statistics(values)["median"] if len(values) == len(rows) else None
+            all_there = statistics(values) if len(values) == len(rows) else {}
+            row |= {key: all_there.get("median"), **{f"{key}_{q}": all_there.get(q) for q in ("median", "q1", "q3")}}
         row["count"] = rows[0]["count"]
         formed.append(row)
     large = [r for r in cost if r["count"] >= 100]
@@ -158,19 +162,31 @@ def finish(config: Config, pieces: Sequence[Record], seeds: Sequence[int]) -> Ou
     fig, axes = panels(1, 2, 7.4, 3.2)
     ax = axes[0, 0]
     n = np.array([r["count"] for r in cost], dtype=float)
-    ax.loglog(n, [r["step_ms"] for r in cost], "o-", color=BLUE, label="law, hold, trigger, list")
-    ax.loglog(n, [r["filter_ms"] for r in cost], "s-", color=GREY, label="safety filter")
-    ax.loglog(n[n >= 100], last["step_ms"] * (n[n >= 100] / n[-1]) ** slope, "--", color=RED, label=f"N^{slope:.2f}")
-    ax.axhline(BAR_MS, color=GREY, ls=":", lw=1)
-    ax.set(xlabel="N", ylabel="CPU time of a step (ms)", title="cost")
+    for key, label, (colour, marker) in (
+        ("step_ms", "law, hold, trigger, list", FAMILY[0]), ("filter_ms", "safety filter", FAMILY[1])
+    ):  # fmt: skip
+        middle, bars = quartiles(cost, key)
+        ax.errorbar(n, middle, bars, fmt=marker + "-", ms=4, capsize=1.5, color=colour, label=label)
+    ax.plot(n[n >= 100], last["step_ms"] * (n[n >= 100] / n[-1]) ** slope, "--", color=RED, label=f"N^{slope:.2f}")
+    ax.axhline(BAR_MS, color=GREY, ls=":", lw=1, label=f"{BAR_MS:.0f} ms wanted")
+    ax.set(xscale="log", yscale="log", xlabel="N", ylabel="CPU time of a step (ms)", title="cost")
     ax.legend(fontsize=7)
     ax = axes[0, 1]
-    for law, colour, label in (("flown", BLUE, "flown law"), ("intent", GREEN, "published intent")):
+    for law, label, (colour, marker) in (("flown", "flown law", FAMILY[0]), ("intent", "published intent", FAMILY[2])):
         shown = [r for r in formed if r[f"{law}_formed_s"] is not None]
-        ax.semilogx([r["count"] for r in shown], [r[f"{law}_formed_s"] for r in shown], "o-", color=colour, label=label)
+        middle, bars = quartiles(shown, f"{law}_formed_s")
+        ax.errorbar([r["count"] for r in shown], middle, bars, fmt=marker + "-", ms=4, capsize=1.5, color=colour,
+                    label=label)  # fmt: skip
+    ax.set_xscale("log")
     ax.set(xlabel="N", ylabel="time to form (s)", title="formation, neighbours within 7.6 m", ylim=(0, None))
     ax.legend(fontsize=7)
-    outcome.figures.append(Figure("scale", "Cost of a step and time to form against the number of agents.", fig))
+    outcome.figures.append(
+        Figure(
+            "scale",
+            "Cost of a step and time to form against the number of agents: median and interquartile range over seeds.",
+            fig,
+        )
+    )
     return outcome
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from hashlib import blake2s
+from math import sqrt
 from pathlib import Path
 from types import FunctionType
 from typing import Any, TypeVar, cast
@@ -17,14 +18,14 @@ from companion.core.law import starling as law
 from companion.core.neighbours import gates
 from companion.core.safety import filter as safety
 from companion.core.safety import program
-from companion.core.trigger import error, periodic, switching
+from companion.core.trigger import error, near, periodic, switching
 from sim.swarm import baselines
 from sim.swarm.state import Floats
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 _MODULES = (
-    baselines, consensus, error, estimate, gates, hold, intent, law, law_tables, paper, periodic, program, safety,
+    baselines, consensus, error, estimate, gates, hold, intent, law, law_tables, near, paper, periodic, program, safety,
     switching, values, vectors,
 )  # fmt: skip
 
@@ -62,6 +63,16 @@ def inlined(function: F) -> F:
     return cast(F, numba.njit(fastmath=FAST, error_model="numpy", inline="always")(function))
 
 
+def _length(x: float, y: float, z: float) -> float:
+    """`math.hypot` of three: numba has it of two only."""
+    return sqrt(x * x + y * y + z * z)
+
+
+def _plane(g_north: float, g_east: float, b: float) -> safety.HalfPlane:
+    """A half-plane with its fields' defaults, which numba does not know."""
+    return safety.HalfPlane(g_north, g_east, b, 0, 0.0, 0.0)
+
+
 _share = compiled(law._share)
 within_budget = compiled(law.within_budget, _share=_share)
 pair = compiled(law.pair)
@@ -89,6 +100,9 @@ half_plane = compiled(
     safety_radius_m=safety_radius_m, barrier=barrier,
 )  # fmt: skip
 out_of_reach = compiled(safety.out_of_reach, safety_radius_m=safety_radius_m)
+push_m_s2 = compiled(safety.push_m_s2)
+resting_push_m_s2 = compiled(safety.resting_push_m_s2, push_m_s2=push_m_s2, barrier=barrier, HalfPlane=compiled(_plane))
+near_push_m_s2 = compiled(near.near_push_m_s2, resting_push_m_s2=resting_push_m_s2, hypot=compiled(_length))
 on_edge = compiled(program.on_edge)
 best = compiled(program.best, on_edge=on_edge)
 give_way = compiled(program.give_way, best=best)

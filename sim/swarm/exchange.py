@@ -31,16 +31,20 @@ from sim.swarm.compiled import (
 from sim.swarm.state import (
     CLASSIC,
     ERROR,
+    FIRST,
     FLOAT_CLOCK,
+    HEARTBEAT,
     HOLD_DAMPED,
     HOLD_FIRST,
     HOLD_OBSERVER,
     INTENT,
+    NEAR,
     NEVER,
     PERIODIC,
     SAMPLE,
     SWITCHING,
     TOLD,
+    TRIGGERED,
     Floats,
     Options,
     State,
@@ -161,7 +165,8 @@ def fires(i: int, k: int, s: State, o: Options, et: ErrorTrigger, st: SwitchingT
         s.counts[2 if math.sqrt(ep) + math.sqrt(ev) > st.eta else 3] += 1
         return switching_exceeds(ep, ev, t, st)
     if kind == PERIODIC:
-        return period_ended(k * o.dt_ns, s.sent_step[i] * o.dt_ns, o.period_ns)
+        shift = s.phase_ns[i, 0]
+        return period_ended(k * o.dt_ns + shift, s.sent_step[i] * o.dt_ns + shift, o.period_ns)
     if kind == FLOAT_CLOCK:
         if t - s.clock[i] >= o.period:
             s.clock[i] = t
@@ -174,6 +179,24 @@ def fires(i: int, k: int, s: State, o: Options, et: ErrorTrigger, st: SwitchingT
     return ep + et.gamma_s2 * ev >= elastic_threshold(res, t, o.relative_sigma, o.elastic_amplitude, o.relative_a)
 
 
+@inlined
+def finds_near(i: int, k: int, s: State) -> bool:
+    """Whether agent i speaks in near mode: some peer is near, or named it."""
+    for e in range(s.start[i], s.start[i + 1]):
+        if s.near_until[e] > k:
+            return True
+    return bool(s.named_until[i] > k)
+
+
+@inlined
+def say_near(i: int, k: int, at: int, near: bool, s: State) -> None:
+    """What a message says of near mode: that the next one is due soon, and who is near."""
+    s.promised[i] = 1 if near else 0
+    s.ring_due[at, i] = s.promised[i]
+    for e in range(s.start[i], s.start[i + 1]):
+        s.ring_near[at, i, s.column[e]] = 1 if near and s.near_until[e] > k else 0
+
+
 @kernel
 def send(
     k: int, tick: int, s: State, ref: Floats, o: Options,
@@ -184,7 +207,7 @@ def send(
     for i in range(s.x.shape[0]):
         at = tick % slots
         s.ring_step[at, i] = NEVER
-        if i == o.fault_agent and k >= o.fault_step + o.fault_frozen:
+        if (i == o.fault_agent and k >= o.fault_step + o.fault_frozen) or k < s.joined[i]:
             continue
         opening = s.sent_step[i] == NEVER
         if not opening:
@@ -198,13 +221,25 @@ def send(
         asked = opening or fires(i, k, s, o, et, st, it)
         silent = (k - s.sent_step[i]) * o.dt
         timed = o.trigger == PERIODIC or o.trigger == FLOAT_CLOCK
-        if not (opening or (asked and (timed or silent >= o.t_min - 1e-9)) or silent >= s.limit[i] - 1e-9):
+        near = o.near == 1 and finds_near(i, k, s)
+        cause = NEVER
+        if opening:
+            cause = FIRST
+        elif silent >= s.limit[i] - 1e-9:
+            cause = HEARTBEAT
+        elif asked and (timed or silent >= o.t_min - 1e-9):
+            cause = TRIGGERED
+        elif near or s.promised[i] == 1:
+            shift = s.phase_ns[i, 1]
+            if period_ended(k * o.dt_ns + shift, s.sent_step[i] * o.dt_ns + shift, o.near_period_ns):
+                cause = NEAR
+        if cause == NEVER:
             continue
         compose(i, k, s, ref, o)
         counted = s.counts[0]
         if not opening or o.count_start == 1:
             if counted < s.events.shape[0]:
-                s.events[counted, 0], s.events[counted, 1] = k, i
+                s.events[counted, 0], s.events[counted, 1], s.events[counted, 2] = k, i, cause
             s.counts[0] += 1
             s.counts[1] += 1
         s.limit[i] = o.t_max * (0.8 + 0.2 * uniform(s.keys[i, 3], k))
@@ -217,6 +252,8 @@ def send(
             for c in range(SAMPLE):
                 s.ring[at, i, c] = s.sent[i, c]
             _digest(i, at, k, s, o)
+            if o.near == 1:
+                say_near(i, k, at, near, s)
 
 
 @inlined
@@ -254,6 +291,16 @@ def _store(e: int, sample: Floats, step: int, size: int, s: State) -> None:
             s.held[e, c] = sample[c]
 
 
+@inlined
+def _cut(i: int, j: int, k: int, s: State) -> bool:
+    """Whether nothing goes from j to i at step k: the network is in two parts, or i does not take part yet."""
+    for p in range(s.partitions.shape[0]):
+        within = s.partitions[p, 0] <= k < s.partitions[p, 1]
+        if within and (i < s.partitions[p, 2]) != (j < s.partitions[p, 2]):
+            return True
+    return bool(k < s.joined[i])
+
+
 @kernel
 def deliver(k: int, tick: int, s: State, o: Options) -> None:
     """Hand over what was sent `delay` control periods ago, less what is lost."""
@@ -282,8 +329,13 @@ def deliver(k: int, tick: int, s: State, o: Options) -> None:
             if d > o.range_m * o.range_m:
                 continue
             lost = s.outage[e] == 1 if o.burst > 0.0 else uniform(s.keys[i, 4], k * n + j) < o.loss
-            if lost:
+            if lost or _cut(i, j, k, s):
                 continue
+            s.counts[4] += 1
+            if o.near == 1 and s.ring_step[at, j] > s.held_step[e]:
+                s.held_due[e] = s.ring_due[at, j]
+                if s.ring_near[at, j, i] == 1:
+                    s.named_until[i] = k + o.near_hold
             _store(e, s.ring[at, j], s.ring_step[at, j], SAMPLE, s)
             for d_at in range(o.digest):
                 about = s.ring_digest_id[at, j, d_at]

@@ -6,9 +6,9 @@ shape in `State`; N agents, R rows (a row is what one receiver holds of one send
 else one for each ordered pair).
 
 What flies besides in a vehicle, and is left out here: the fence, the limits on jerk and speed, the altitude with its
-own loop and limits (the law acts in all three dimensions here), the bias observer, near mode, what a peer does on the
-ground or under its pilot, the growth of a lost peer's uncertainty. Sums over neighbours are rounded after each term,
-once in a vehicle: commands differ by less than 1e-9 of what is summed.
+own loop and limits (the law acts in all three dimensions here), the bias observer, what a peer does on the ground or
+under its pilot, announcements and their repeats, the growth of a lost peer's uncertainty. Sums over neighbours are
+rounded after each term, once in a vehicle: commands differ by less than 1e-9 of what is summed.
 """
 
 import math
@@ -39,7 +39,7 @@ from sim.swarm.compiled import (
     within_budget,
 )
 from sim.swarm.exchange import deliver, normal3, predict_all, send, uniform
-from sim.swarm.rows import constrain, sums_over
+from sim.swarm.rows import constrain, is_near, sums_over
 from sim.swarm.state import ERROR_BIN_M, ERROR_BINS, NEVER, Floats, Options, State
 
 
@@ -149,6 +149,16 @@ def look(i: int, k: int, own: Floats, common: Ned, s: State, ref: Floats, o: Opt
         near[q, 9], near[q, 10], near[q, 11], near[q, 12] = 1.0, 1.0, uncertainty, 0.0
         near[q, 16], near[q, 17], near[q, 18] = w0, w1, w2
         near[q, 19], near[q, 20], near[q, 21] = a0, a1, a2
+    if k < s.joined[i]:
+        return 0
+    if o.near == 1:
+        for q in range(count):
+            e = near_row[q]
+            if s.held_due[e] == 1:
+                near[q, 11] = s.missing[min(k - held_step[e], s.missing.shape[0] - 1)]
+    if s.linked.shape[0] > 0:
+        for q in range(count):
+            near[q, 9] = float(s.linked[near_row[q]])
     if not (several or gated or somebody_lost or o.leaderless == 1):
         return count
     for q in range(count):
@@ -246,14 +256,18 @@ def intended(
 
 @inlined
 def keep_apart(
-    i: int, count: int, u0: float, u1: float, u2: float, shared: Ned, s: State, o: Options
+    i: int, count: int, u0: float, u1: float, u2: float, k: int, slot_velocity: Ned, shared: Ned, s: State, o: Options
 ) -> None:  # fmt: skip
-    """The command of agent i, after the safety filter if it is on, into s.u; see `look`."""
+    """The command of agent i, after the safety filter if it is on, into s.u, and whom it finds near; see `look`."""
     if o.barrier == 1:
         q = s.measured[i]
         true = VehicleState(0, Ned(q[0], q[1], q[2]), Ned(q[3], q[4], q[5]))
         kept = constrain(u0, u1, true, shared, s.near, count, o.avoidance_max, s.planes, s.spare)
         u0, u1 = kept.north, kept.east
+        if o.near == 1:
+            for row in range(count):
+                if is_near(true, slot_velocity, shared, s.near, row, o.avoidance_max, o.near_closest, o.near_radius):
+                    s.near_until[s.near_row[row]] = k + o.near_hold
     s.u[i, 0], s.u[i, 1], s.u[i, 2] = u0, u1, u2
 
 
@@ -266,12 +280,20 @@ def command(k: int, s: State, ref: Floats, o: Options, g: Gains, ig: IntentGains
         own = s.own[i] if o.own_held == 1 else s.measured[i]
         ego = VehicleState(0, Ned(own[0], own[1], own[2]), Ned(own[3], own[4], own[5]))
         v_d = Ned(ref[k, m, 3], ref[k, m, 4], ref[k, m, 5])
-        common = v_d
+        shared = Ned(ref[k, m, 6], ref[k, m, 7], ref[k, m, 8])
+        common, asked = v_d, shared
+        informed = s.informed[i] == 1
+        if informed:
+            for c in range(3):
+                s.common[i, c] = s.wish[k, c]
+            asked = Ned(s.wish[k, 3], s.wish[k, 4], s.wish[k, 5])
         if o.leaderless == 1:
             common = Ned(s.common[i, 0], s.common[i, 1], s.common[i, 2])
-        reference = Reference(
-            Ned(s.slot[i, 0], s.slot[i, 1], s.slot[i, 2]), common, Ned(ref[k, m, 6], ref[k, m, 7], ref[k, m, 8]), 0.0
-        )
+        place = Ned(s.slot[i, 0], s.slot[i, 1], s.slot[i, 2])
+        if k < s.joined[i]:
+            # it flies along with the plan where it is
+            place = ego.position_ned_m
+        reference = Reference(place, common, asked, 0.0)
         count = look(i, k, own, common, s, ref, o)
         sums = sums_over(ego, common, s.near, count, False, g)
         if o.separation_on_truth == 1 or o.separation_kind != CUT:
@@ -287,9 +309,9 @@ def command(k: int, s: State, ref: Floats, o: Options, g: Gains, ig: IntentGains
             u0, u1, u2 = combine(sums, ego, reference, g)
             residual = mean_residual(sums)
             s.residual[i, 0], s.residual[i, 1], s.residual[i, 2] = residual.north, residual.east, residual.down
-        if o.leaderless == 1:
+        if o.leaderless == 1 and not informed:
             agree(i, count, dt, s, o)
-        keep_apart(i, count, u0, u1, u2, reference.acceleration_ned_m_s2, s, o)
+        keep_apart(i, count, u0, u1, u2, k, common, shared, s, o)
 
 
 @kernel
@@ -330,9 +352,16 @@ def move(k: int, s: State, o: Options) -> None:
                 s.v[i, c] *= brake
                 s.x[i, c] += dt * s.v[i, c]
             continue
+        share = 1.0
+        for row in range(s.disturbances.shape[0]):
+            if s.disturbances[row, 0] == i and s.disturbances[row, 1] <= k < s.disturbances[row, 2]:
+                share *= s.disturbances[row, 3]
+                d0 += s.disturbances[row, 4]
+                d1 += s.disturbances[row, 5]
+                d2 += s.disturbances[row, 6]
         for c in range(3):
             d = d0 if c == 0 else d1 if c == 1 else d2
-            s.a[i, c] += follow * (s.u[i, c] - s.a[i, c])
+            s.a[i, c] += follow * (share * s.u[i, c] - s.a[i, c])
             acceleration = s.a[i, c] + d
             s.x[i, c] += dt * s.v[i, c] + 0.5 * dt * dt * acceleration
             s.v[i, c] += dt * acceleration

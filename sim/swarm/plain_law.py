@@ -90,4 +90,5 @@ def command(
 ) -> None:  # fmt: skip
     """`kernels.keep_apart` of agent i, whose slot accelerates as the plan says."""
     m = i if ref.shape[1] > 1 else 0
-    keep_apart(i, count, u0, u1, u2, Ned(ref[k, m, 6], ref[k, m, 7], ref[k, m, 8]), s, o)
+    velocity = Ned(ref[k, m, 3], ref[k, m, 4], ref[k, m, 5])
+    keep_apart(i, count, u0, u1, u2, k, velocity, Ned(ref[k, m, 6], ref[k, m, 7], ref[k, m, 8]), s, o)

@@ -10,8 +10,19 @@ from companion.core.law.base import Wanted
 from companion.core.law.starling import Gains, Sums
 from companion.core.safety import filter as safety
 from companion.core.trajectory.fleet import Reference
+from companion.core.trigger.near import PUSH_M_S2
 from companion.core.values import Neighbour, VehicleState
-from sim.swarm.compiled import avoid, combine, half_plane, kernel, mean_residual, out_of_reach, share
+from sim.swarm.compiled import (
+    avoid,
+    combine,
+    half_plane,
+    kernel,
+    mean_residual,
+    near_push_m_s2,
+    out_of_reach,
+    push_m_s2,
+    share,
+)
 from sim.swarm.state import ROW, Floats
 
 
@@ -59,6 +70,18 @@ def constrain(
     return avoid(
         u_north, u_east, ego.velocity_ned_m_s.north, ego.velocity_ned_m_s.east, planes, peers, peers, most, spare
     )
+
+
+@kernel
+def is_near(
+    ego: VehicleState, slot_velocity: Ned, shared: Ned, rows: Floats, k: int, most: float, closest: float, radius: float
+) -> bool:
+    """Whether the peer of row k is near, as `vehicle.publisher` takes it from the filter's half-planes."""
+    n = neighbour(rows, k)
+    if rows[k, 12] > 0.0 or out_of_reach(ego, shared, n, most):
+        return False
+    push = push_m_s2(half_plane(ego, shared, n))
+    return push < PUSH_M_S2 and push < near_push_m_s2(n, slot_velocity, closest, radius)
 
 
 def as_rows(neighbours: Sequence[Neighbour]) -> Floats:

@@ -11,6 +11,7 @@ from typing import Any, Literal, get_args, get_origin
 import numpy as np
 from pydantic import ValidationError
 
+from companion.config.derived import SPACING_MARGIN_M
 from companion.config.law_tables import LAWS, LawTable
 from companion.config.messages import sentence
 from companion.core.formation import SHAPES
@@ -20,6 +21,8 @@ from companion.core.monitor import PeerMotion
 from companion.core.safety.filter import COLLISION_DISTANCE_M, LAG_ALLOWANCE_M
 from companion.core.trigger import base as rule
 from companion.core.trigger.error import ErrorTrigger
+from companion.core.trigger.near import HOLD_S as NEAR_HOLD_S
+from companion.core.trigger.near import near_bound_m
 from companion.core.trigger.periodic import PeriodicTrigger
 from companion.core.trigger.switching import SwitchingTrigger
 from companion.errors import ConfigError
@@ -37,6 +40,7 @@ from sim.swarm.state import (
     INTENT,
     PERIODIC,
     SWITCHING,
+    Flags,
     Floats,
     Options,
 )
@@ -115,12 +119,16 @@ class Setup:
     velocity_m_s: tuple[float, float, float] = (1.0, 0.0, 0.0)
     turn_rad_s: float = 0.0
     """the plan's velocity turns at this rate; slots keep their directions"""
+    legs: tuple[tuple[float, float, float], ...] = ()
+    """(begin (s), angle (rad), how long (s)): there the plan's velocity turns by that angle besides, at one rate"""
     duration_s: float = 60.0
     dt_s: float = 0.01
     control_every: int = 1
     """steps per control period"""
     plan: bool = True
     """False: leaderless, the agents agree on the velocity that they start with"""
+    informed: tuple[int, ...] = ()
+    """leaderless agents that know the motion (velocity, turn, legs) and fly by it; nobody passes it on"""
 
     start_ball_m: float = 0.5
     """agents start anywhere in a ball of this radius about their slots"""
@@ -154,6 +162,9 @@ class Setup:
     separation: Separation = "cut"
     range_m: float = 100.0
     range_on_truth: bool = False
+    nearest: int = 0
+    """alignment and cohesion heed only the so many nearest by slot, and whoever has an agent among its own nearest, so
+    that the graph is undirected; 0: everybody within range"""
 
     intent_k_p: float = 5.6
     intent_k_d: float = 7.7
@@ -169,6 +180,11 @@ class Setup:
     t_min_s: float = 0.05
     t_max_s: float = 10.0
     period_s: float = 0.05
+    period_spread: bool = False
+    """agents' periods end at times of their own, as in flight, from a start that the seed draws; False: all at once"""
+    near: bool = False
+    """near mode (`core.trigger.near`), which needs the barrier"""
+    near_period_s: float = 0.1
     count_start: bool = True
     send_filter: bool = True
     alpha: float = 0.1
@@ -188,6 +204,7 @@ class Setup:
     digest: int = 0
     """samples of peers in a message"""
     loss: float = 0.0
+    """1: nothing that is sent arrives"""
     burst_s: float = 0.0
     """mean length of a link's outage; 0: losses are independent"""
     delay_s: float = 0.0
@@ -201,6 +218,13 @@ class Setup:
     push_time_s: float = math.inf
     push_m_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """at push_time_s this is added to one agent's velocity"""
+    disturbances: tuple[tuple[float, float, float, float, float, float, float], ...] = ()
+    """(agent, from (s), to (s), share of its acceleration that it gets, push north, east, down (m/s^2))"""
+    partitions: tuple[tuple[float, float, float], ...] = ()
+    """(from (s), to (s), agent): meanwhile the agents below this one and the rest do not hear each other"""
+    joins: tuple[tuple[float, float, float, float, float], ...] = ()
+    """(agent, at (s), north, east, down (m)): it starts that far from its slot, flies along by the plan's velocity and
+    takes part, heard and hearing, from then on"""
     sigma_p_m: float = 0.0
     sigma_p_time_s: float = 2.0
     sigma_v_m_s: float = 0.0
@@ -229,7 +253,19 @@ class Setup:
                      "t_min_s", "burst_s", "delay_s", "gust_m_s2", "impulse_m_s2", "lag_s", "sigma_p_m",
                      "sigma_v_m_s"):  # fmt: skip
             _check(0 <= getattr(self, name) < math.inf, name, getattr(self, name), ">= 0")
-        _check(0 <= self.loss < 1, "loss", self.loss, "in [0, 1)")
+        _check(0 <= self.loss <= 1, "loss", self.loss, "in [0, 1]")
+        _check(self.near_period_s > 0, "near_period_s", self.near_period_s, "> 0")
+        _check(self.barrier or not self.near, "near", self.near, "false without the barrier, whose measure it is")
+        for name, width in (("legs", 3), ("disturbances", 7), ("partitions", 3), ("joins", 5)):
+            rows = getattr(self, name)
+            _check(all(len(r) == width for r in rows), name, rows, f"rows of {width} numbers")
+        n = self.formation.count
+        agents = (*self.informed, *(d[0] for d in (*self.disturbances, *self.joins)))
+        _check(all(a in range(n) for a in agents), "an agent", agents, f"one of 0..{n - 1}")
+        _check(self.plan or not self.joins, "joins", self.joins, "empty without a plan, by which a joiner comes")
+        _check(not (self.plan and self.informed), "informed", self.informed, "empty with a plan, which all know")
+        _check(0 <= self.nearest < n <= DENSE_MAX or not self.nearest, "nearest", self.nearest,
+               f"less than the agents, {DENSE_MAX} at most")  # fmt: skip
         _check(self.control_every >= 1, "control_every", self.control_every, "at least 1")
         _check(0 <= self.digest <= DIGEST_MAX, "digest", self.digest, f"in 0..{DIGEST_MAX}")
         self.law_table()
@@ -264,7 +300,13 @@ class Setup:
     @property
     def per_link(self) -> bool:
         """Whether receivers may hold different samples of one sender."""
-        return self.links or self.loss > 0 or self.delay_s > 0 or self.digest > 0
+        lossy = self.loss > 0 or self.delay_s > 0 or self.digest > 0
+        return self.links or lossy or self.near or bool(self.partitions or self.joins)
+
+    @property
+    def uncertainty_m(self) -> float:
+        """Of every prediction (m): the safety radius less what the filter adds itself."""
+        return self.barrier_radius_m - COLLISION_DISTANCE_M - LAG_ALLOWANCE_M
 
     @property
     def peer_motion(self) -> PeerMotion:
@@ -303,11 +345,12 @@ def setup_from(values: Mapping[str, Any], where: str, base: Setup | None = None)
     formation = base.formation
     if "formation" in given:
         formation = _filled(formation, given.pop("formation"), f"{where}.formation")
-    filled: Setup = _filled(base, given, where)
-    return replace(filled, formation=formation)
+    filled: Setup = _filled(base, given, where, formation=formation)
+    return filled
 
 
-def _filled(base: Any, values: Mapping[str, Any], where: str) -> Any:
+def _filled(base: Any, values: Mapping[str, Any], where: str, **others: Any) -> Any:
+    """`base` with a table's values, each checked, and with `others` as they are."""
     known = {f.name: f.type for f in fields(base)}
     for name, value in values.items():
         if name not in known:
@@ -323,11 +366,14 @@ def _filled(base: Any, values: Mapping[str, Any], where: str) -> Any:
             or (kind is int and not isinstance(value, int))
         ):
             raise ConfigError(f"{where}.{name} must be {getattr(kind, '__name__', kind)}, got {value!r}")
-    converted = {
-        name: float(value) if known[name] is float else tuple(map(float, value)) if isinstance(value, list) else value
-        for name, value in values.items()
-    }
-    return replace(base, **converted)
+    return replace(base, **{name: _as(known[name], value) for name, value in values.items()}, **others)
+
+
+def _as(kind: Any, value: Any) -> Any:
+    """A TOML value as its setting keeps it: numbers with a fraction where it has one, lists as tuples."""
+    if isinstance(value, list):
+        return tuple(_as((*get_args(kind), float)[0], v) for v in value)
+    return float(value) if kind is float else value
 
 
 def connected(slots: Floats, range_m: float) -> bool:
@@ -341,6 +387,27 @@ def connected(slots: Floats, range_m: float) -> bool:
     for _ in range(n):
         reached = reached | near[reached].any(axis=0)
     return bool(reached.all())
+
+
+def linked_pairs(setup: Setup) -> Flags:
+    """Which ordered pairs alignment and cohesion heed, in the order of the rows; empty: all."""
+    n = setup.formation.count
+    if not setup.nearest:
+        return np.zeros(0, dtype=np.uint8)
+    slots = setup.formation.slots()
+    apart = np.linalg.norm(slots[:, None] - slots[None, :], axis=2)
+    linked = np.zeros((n, n), dtype=np.uint8)
+    for i, order in enumerate(np.argsort(apart, axis=1, kind="stable")):
+        linked[i, order[order != i][: setup.nearest]] = 1
+    linked |= linked.T
+    return linked[~np.eye(n, dtype=bool)]
+
+
+def near_uncertainty_m(setup: Setup) -> Floats:
+    """Uncertainty of a near peer by the age of its sample in steps (m); empty without near mode."""
+    steps = round(setup.t_max_s / setup.dt_s) + 1 if setup.near else 0
+    motion = setup.peer_motion
+    return np.array([near_bound_m(k * setup.dt_s, setup.uncertainty_m, motion) for k in range(steps)])
 
 
 _HOLDS: Mapping[Hold, int] = {
@@ -395,7 +462,7 @@ def run_options(setup: Setup) -> Options:
         digest=min(setup.digest, setup.formation.count - 1),
         gates_after=setup.gates_after_s,
         barrier=int(setup.barrier),
-        uncertainty=setup.barrier_radius_m - COLLISION_DISTANCE_M - LAG_ALLOWANCE_M,
+        uncertainty=setup.uncertainty_m,
         avoidance_max=setup.avoidance_max_m_s2,
         sigma_p=setup.sigma_p_m,
         sigma_p_time=setup.sigma_p_time_s,
@@ -418,6 +485,11 @@ def run_options(setup: Setup) -> Options:
         fault_step=round(setup.fault_time_s / setup.dt_s) if fault else 2**40,
         fault_frozen=round(0.5 / setup.dt_s) if setup.fault == "freeze" else 0,
         presence_delay=setup.presence_delay_s,
+        near=int(setup.near),
+        near_period_ns=round(setup.near_period_s * 1e9),
+        near_hold=round(NEAR_HOLD_S / setup.dt_s),
+        near_closest=max(setup.r0_m, setup.barrier_radius_m) + SPACING_MARGIN_M,
+        near_radius=setup.barrier_radius_m,
         bound_m=setup.error_bound_m,
         dense_measures=int(setup.dense_measures and setup.formation.count <= DENSE_MAX),
     )

@@ -23,6 +23,11 @@ ROW = 22
 """floats of a `Neighbour`: p^ 3, v^ 3, d_ij 3, in formation, shares the avoidance, uncertainty, lost, last seen 3,
 slot's velocity 3 and acceleration 3"""
 NEVER = -1
+ERROR_BIN_M = 0.001
+ERROR_BINS = 4000
+CAUSES = ("first", "heartbeat", "triggered", "near")
+"""why a message was sent: the first; silence as long as T_max; the trigger, be it an error or a period; near mode"""
+FIRST, HEARTBEAT, TRIGGERED, NEAR = 0, 1, 2, 3
 
 
 class Options(NamedTuple):
@@ -89,6 +94,14 @@ class Options(NamedTuple):
     fault_frozen: int
     """steps for which the failing vehicle's measurements stand still before it falls silent"""
     presence_delay: float
+    near: int
+    """1: near mode, see `core.trigger.near`"""
+    near_period_ns: int
+    near_hold: int
+    """steps for which a pair stays near"""
+    near_closest: float
+    near_radius: float
+    """the safety radius of a peer whose messages are not missing (m)"""
     bound_m: float
     """on the error of every prediction"""
     dense_measures: int
@@ -175,10 +188,38 @@ class State(NamedTuple):
     """see MEASURES"""
     error_bins: Ints
     """how many predictions were wrong by so many ERROR_BIN_M; the last one holds what is larger"""
+    phase_ns: Ints
+    """(N, 2): by how much each agent's periods, and near mode's, end earlier than the run's own"""
+    informed: Flags
+    """(N,) 1: this leaderless agent knows the motion"""
+    wish: Floats
+    """(steps + 1, 6): velocity and acceleration that the informed know"""
+    linked: Flags
+    """(R of every ordered pair,) 1: alignment and cohesion heed this pair"""
+    disturbances: Floats
+    """rows (agent, first step, step after the last, share of its acceleration that it gets, push 3 (m/s^2))"""
+    partitions: Ints
+    """rows (first step, step after the last, agents below this one hear none of the rest)"""
+    joined: Ints
+    """(N,): the step from which an agent hears and is heard"""
+    missing: Floats
+    """uncertainty of a near peer by the age of its sample in steps (m)"""
+    near_until: Ints
+    """(R,): the step until which a peer is near"""
+    named_until: Ints
+    """(N,): the same after a peer named this agent"""
+    promised: Flags
+    """(N,) 1: the last message said that the next one is due soon"""
+    held_due: Flags
+    """(R,) 1: so did the sender's last message that arrived"""
+    ring_due: Flags
+    """(delay + 1, N)"""
+    ring_near: Flags
+    """(delay + 1, N, N): whom each message names"""
     events: Ints
-    """(most, 2): step, agent"""
+    """(most, 3): step, agent, cause"""
     counts: Ints
-    """[number of events, bytes' samples sent, mode steps dynamic, mode steps fixed]"""
+    """[number of events, bytes' samples sent, mode steps dynamic, mode steps fixed, messages that reached somebody]"""
     record: Floats
     """(steps kept, N, 6)"""
 

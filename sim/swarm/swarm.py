@@ -18,9 +18,10 @@ import numpy.typing as npt
 
 from companion.core.law.base import FIELDS_MAX
 from companion.errors import ConfigError
+from companion.vehicle.publisher import CLOCK_SHIFT_NS
 from sim.swarm.neighbour_list import NeighbourList
-from sim.swarm.setup import DENSE_MAX, Setup, connected, rules_of, run_options
-from sim.swarm.state import ERROR_BIN_M, ERROR_BINS, MEASURES, ROW, SAMPLE, Floats, Ints, State
+from sim.swarm.setup import DENSE_MAX, Setup, connected, linked_pairs, near_uncertainty_m, rules_of, run_options
+from sim.swarm.state import CAUSES, ERROR_BIN_M, ERROR_BINS, MEASURES, ROW, SAMPLE, Floats, Ints, State
 
 
 def kernels() -> ModuleType:
@@ -49,7 +50,7 @@ class Run:
     reference: Floats
     """(T, N, 6): p_ref,i of each slot and its velocity"""
     events: Ints
-    """(messages, 2): step, agent"""
+    """(messages, 3): step, agent, cause (an index of `state.CAUSES`)"""
     messages: int
     samples_sent: int
     """own samples and digest entries together"""
@@ -59,6 +60,8 @@ class Run:
     measures: dict[str, float] = field(default_factory=dict)
     error_bins: Ints = field(default_factory=lambda: np.zeros(ERROR_BINS, dtype=np.int64))
     """how many predictions were wrong by so many millimetres"""
+    received: int = 0
+    """how often a message reached a receiver, where receivers hold samples of their own"""
 
     def healthy(self) -> npt.NDArray[np.bool_]:
         """Agents that did not fail."""
@@ -92,6 +95,11 @@ class Run:
         """Messages of each agent, shape (N,)."""
         return np.bincount(self.events[:, 1], minlength=self.position_m.shape[1]).astype(np.int64)
 
+    def by_cause(self) -> dict[str, int]:
+        """How many messages were sent for which of `state.CAUSES`."""
+        counted = np.bincount(self.events[:, 2], minlength=len(CAUSES))
+        return {cause: int(n) for cause, n in zip(CAUSES, counted, strict=True)}
+
 
 def quantile_m(error_bins: Ints, share: float) -> float:
     """The error that this share of all predictions does not exceed (m), to a bin's width."""
@@ -100,13 +108,27 @@ def quantile_m(error_bins: Ints, share: float) -> float:
 
 
 def reference_table(setup: Setup, steps: int) -> Floats:
-    """The plan's common motion, shape (steps, 1, 9): p (m), v (m/s), a (m/s^2) at each step; zeros without a plan."""
+    """What all know of the common motion, shape (steps, 1, 9), as `motion_table`; zeros without a plan."""
+    return motion_table(setup, steps) if setup.plan else np.zeros((steps, 1, 9))
+
+
+def motion_table(setup: Setup, steps: int) -> Floats:
+    """The common motion, shape (steps, 1, 9): p (m), v (m/s), a (m/s^2) at each step."""
     t = np.arange(steps) * setup.dt_s
     table = np.zeros((steps, 1, 9))
-    if not setup.plan:
-        return table
     vx, vy, vz = setup.velocity_m_s
     rate = setup.turn_rad_s
+    if setup.legs:
+        heading, turning = rate * t, np.full(steps, rate)
+        for begin_s, angle_rad, over_s in setup.legs:
+            heading = heading + angle_rad * np.clip((t - begin_s) / over_s, 0.0, 1.0)
+            turning = turning + np.where((t >= begin_s) & (t < begin_s + over_s), angle_rad / over_s, 0.0)
+        s, c = np.sin(heading), np.cos(heading)
+        v = np.stack([vx * c - vy * s, vx * s + vy * c, np.full(steps, vz)], axis=1)
+        table[:, 0, 3:6] = v
+        table[:, 0, 6], table[:, 0, 7] = -turning * v[:, 1], turning * v[:, 0]
+        table[1:, 0, :3] = np.cumsum(0.5 * setup.dt_s * (v[1:] + v[:-1]), axis=0)
+        return table
     if rate == 0.0:
         table[:, 0, :3] = t[:, None] * np.array(setup.velocity_m_s)
         table[:, 0, 3:6] = setup.velocity_m_s
@@ -139,7 +161,20 @@ def starts(setup: Setup, seed: int) -> tuple[Floats, Floats]:
                 break
         x[i] = place
         v[i] += setup.start_velocity_m_s * rng.uniform(-1, 1, size=3)
+    for agent, _, *aside in setup.joins:
+        x[int(agent)] += aside
     return x, v
+
+
+def _phases_ns(setup: Setup, seed: int) -> Ints:
+    """By how much each agent's periods and near mode's end earlier than the run's own, shape (count, 2)."""
+    place = np.arange(setup.formation.count)
+    phases = np.zeros((setup.formation.count, 2), dtype=np.int64)
+    phases[:, 1] = CLOCK_SHIFT_NS * place
+    if setup.period_spread:
+        first = np.random.default_rng([seed, 10**6 + 1]).random()
+        phases[:, 0] = np.round((first + CLOCK_SHIFT_NS * 1e-9 * place) % 1.0 * setup.period_s * 1e9)
+    return phases
 
 
 @lru_cache(maxsize=4)
@@ -180,6 +215,12 @@ def state_of(
     kept = -(-steps // setup.keep_every)
     depth = o.delay + 1 if o.links else 1
     ring_digest = max(o.digest, 1)
+    talks = n if o.near else 0
+    motion = motion_table(setup, steps + 1)[:, 0, 3:]
+    informed, joined = np.zeros(n, dtype=np.uint8), np.zeros(n, dtype=np.int64)
+    informed[list(setup.informed)] = 1
+    for agent, at_s, *_ in setup.joins:
+        joined[int(agent)] = round(at_s / setup.dt_s)
     s = State(
         x=x, v=v, a=np.zeros((n, 3)), gust=np.zeros((n, 3)), bias=np.zeros((n, 3)), measured=np.zeros((n, 6)),
         filtered=np.zeros((n, 6)), u=np.zeros((n, 3)), common=np.zeros((n, 3)), anchor=np.zeros((n, 3)),
@@ -199,8 +240,20 @@ def state_of(
         outage=np.zeros(rows, dtype=np.uint8), keys=agent_keys(seed, n),
         **_room(int(np.diff(start).max()) + 1),
         measures=np.array([1e9, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]), error_bins=np.zeros(ERROR_BINS, dtype=np.int64),
-        events=np.zeros((n * (steps // setup.control_every + 1), 2), dtype=np.int64),
-        counts=np.zeros(4, dtype=np.int64), record=np.zeros((kept, n, 6)),
+        phase_ns=_phases_ns(setup, seed), informed=informed, wish=np.ascontiguousarray(motion),
+        linked=linked_pairs(setup), joined=joined,
+        disturbances=np.array([
+            (agent, round(a / setup.dt_s), b / setup.dt_s, *rest) for agent, a, b, *rest in setup.disturbances
+        ], dtype=float).reshape(-1, 7),
+        partitions=np.array([
+            (round(a / setup.dt_s), round(b / setup.dt_s), int(below)) for a, b, below in setup.partitions
+        ], dtype=np.int64).reshape(-1, 3),
+        missing=near_uncertainty_m(setup), near_until=np.zeros(rows if o.near else 0, dtype=np.int64),
+        named_until=np.zeros(n, dtype=np.int64), promised=np.zeros(n, dtype=np.uint8),
+        held_due=np.zeros(rows if o.near else 0, dtype=np.uint8), ring_due=np.zeros((depth, n), dtype=np.uint8),
+        ring_near=np.zeros((depth, talks, talks), dtype=np.uint8),
+        events=np.zeros((n * (steps // setup.control_every + 1), 3), dtype=np.int64),
+        counts=np.zeros(5, dtype=np.int64), record=np.zeros((kept, n, 6)),
     )  # fmt: skip
     _start_estimates(s, setup, table, o)
     return s
@@ -259,6 +312,7 @@ def run(setup: Setup, seed: int, *, reference: Floats | None = None, start: tupl
         steps_fixed=int(s.counts[3]),
         measures=dict(zip(MEASURES, map(float, s.measures), strict=True)),
         error_bins=s.error_bins,
+        received=int(s.counts[4]),
     )
 
 

@@ -289,7 +289,7 @@ def test_a_peer_that_vanishes_is_left_behind_and_nobody_touches_it() -> None:
     ("values", "says"),
     [
         ({"formation": {"count": 1}}, "formation.count must be at least 2"),
-        ({"loss": 1.0}, "loss must be"),
+        ({"loss": 1.1}, "loss must be"),
         ({"hold": "cubic"}, "must be one of zero, first, damped, observer"),
         ({"speed": 1.0}, "is not a setting"),
         ({"dt_s": float("nan")}, "dt_s must be > 0"),
