@@ -48,7 +48,7 @@ class ErrorTable(TriggerTable):
     """below a centimetre every tick is an event; the safety radius grows with it"""
     gamma_s2: Gamma = 0.1
     kappa: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)] = 0.3
-    epsilon_nu_m_s: Annotated[float, Field(ge=0.01, le=5, allow_inf_nan=False)] = 0.05
+    epsilon_nu_m_s: Annotated[float, Field(ge=0.01, le=5, allow_inf_nan=False)] = 0.03
     """of the common velocity, where no plan gives one"""
 
     def trigger(self) -> Trigger:

@@ -21,7 +21,7 @@ class ErrorTrigger(NamedTuple):
     epsilon_m: float
     gamma_s2: float
     kappa: float
-    epsilon_nu_m_s: float = 0.05
+    epsilon_nu_m_s: float = 0.03
 
     def fires(self, now: Situation) -> bool:
         """Eq. (4) with the threshold epsilon, raised by the residual; and the common velocity's own threshold."""
