@@ -146,7 +146,7 @@ def test_near_ids_out_of_order_or_twice_are_refused(near: tuple[int, ...]) -> No
 def test_a_flag_that_nobody_knows_is_refused() -> None:
     payload = bytearray(encode_state(MESSAGE))
     assert payload[FLAGS_AT] == 1
-    payload[FLAGS_AT] = 1 | 4
+    payload[FLAGS_AT] = 1 | 8
     with pytest.raises(WireError, match="flags"):
         decode_state(bytes(payload))
 

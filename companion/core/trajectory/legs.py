@@ -64,7 +64,7 @@ class GotoLeg:
 
 @dataclass(frozen=True, slots=True)
 class FreeLeg:
-    """No common motion that all share, for ever: the vehicles agree on one by what they publish (`core.agreement`).
+    """No common motion that all share, for ever: the vehicles agree on one by what they publish (`vehicle.agreement`).
 
     What is shared goes on: slots, heading, altitude. The centre stands in it, and the common motion comes on top.
     """
