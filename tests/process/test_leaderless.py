@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
-from fleet_process import SETTLED, all_in, flight_folder, make_fleet, operator_of, run, started, wait_status
+from fleet_process import all_in, flight_folder, make_fleet, operator_of, run, started, wait_status
 
 from companion.io.replay import replay_file
 from companion.wire.operator import Status
@@ -22,7 +22,7 @@ def test_four_follow_the_one_that_is_told_and_hold_where_they_are_by_then(tmp_pa
 
     with started("sim", "up", "--json", "--fleet", str(fleet.file), "--out", str(out), folder=fleet.folder) as up:
         with operator_of(fleet) as operator:
-            wait_status(operator, all_in(fleet.ids, *SETTLED, revision=2))
+            wait_status(operator, all_in(fleet.ids, "moving"))
             asked = run(
                 "sim", "move", "--vehicle", "3", "--velocity", "0.5", "0", "0", "--fleet", str(fleet.file),
                 folder=fleet.folder,
