@@ -14,7 +14,14 @@ FLEETS = ("test_fleet_up.py", "test_missing.py")
 """files of tests/process that fly whole fleets: half of the time of all"""
 TOGETHER = ("test_flight.py", "test_faults.py", "test_damaged_recordings.py")
 """files of tests/lockstep whose tests look at flights that they share"""
-COMPILED = ("test_swarm.py", "test_swarm_lockstep.py", "test_study.py")
+COMPILED = (
+    "test_foreign_study.py",
+    "test_study.py",
+    "test_swarm.py",
+    "test_swarm_lockstep.py",
+    "test_swarm_scenes.py",
+    "test_worth.py",
+)
 """files of tests/unit that compile the swarm: once for all of them"""
 LANES = 2
 NICENESS = 10

@@ -201,14 +201,15 @@ def test_the_summary_shows_no_control_characters(text: str) -> None:
         ),
         text,
     )  # fmt: skip
-    steady = dict.fromkeys(
+    steady: dict[str, Any] = dict.fromkeys(
         (
             "formation_error_rms_m", "seconds", "velocity_error_rms_m_s", "centroid_error_rms_m",
             "messages_per_vehicle_hz", "reduction_vs_20hz_percent", "payload_bytes_per_vehicle_s",
-            "wire_bytes_per_vehicle_s",
+            "wire_bytes_per_vehicle_s", "packets_per_vehicle_hz", "packets_reduction_vs_20hz_percent", "lambda2_min",
         ),
         1.0,
     )  # fmt: skip
+    steady |= {"network": text}
     order = {
         "at_s": 31.4, "verb": "kill", "issuer": text, "id": text, "accepted": [3], "refused": {"1": text},
         "unanswered": [2],
