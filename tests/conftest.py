@@ -51,6 +51,9 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
         def _split_scope(self, nodeid: str) -> str:
             return lane(nodeid)
 
+    # Dealt out in the order of the items, as they are sorted below, not the lane of most tests first: what keeps real
+    # time would wait, and run on the worker that gives way.
+    config.option.loadscopereorder = False
     return Lanes(config, log)
 
 
