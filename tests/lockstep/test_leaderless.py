@@ -85,6 +85,11 @@ class Turned:
 
 @pytest.fixture(scope="module")
 def six() -> Turned:
+    """Looked at by several tests, so none of them flies it on."""
+    return flown_six()
+
+
+def flown_six() -> Turned:
     legs = [
         *straight(12.0), {"kind": "turn", "rate_deg_s": 30.0, "angle_deg": 90.0},
         {"kind": "velocity", "east_m_s": 1.0, "duration_s": 100.0},
@@ -115,7 +120,8 @@ def test_a_flight_without_a_shared_motion_replays_byte_for_byte(six: Turned, veh
     assert result.same, result.sentence()
 
 
-def test_a_companion_that_is_started_anew_has_lost_its_wish_and_the_rest_flies_on(six: Turned) -> None:
+def test_a_companion_that_is_started_anew_has_lost_its_wish_and_the_rest_flies_on() -> None:
+    six = flown_six()
     ls = six.ls
     ls.kill(2)
     wait(ls, 3.0)
