@@ -75,9 +75,9 @@ class Inbox:
 
     def drain(self) -> list[Event]:
         """`PeerTransport.drain`."""
-        if not len(self._mailbox) and not self._presence:
-            return []
         with self._lock:
+            if not len(self._mailbox) and not self._presence:
+                return []
             events: list[Event] = [*self._mailbox.take(), *self._presence.values()]
             if self._presence:
                 self._presence.clear()

@@ -16,6 +16,7 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ from companion.io.network import peer_transport
 from companion.io.recorder import Recorder
 from companion.io.records import TickRecord, TrafficRecord, peer_body
 from companion.io.systemd import Notifier
-from companion.io.transport import Connect, PresenceChange, ReceivedSample, Request, Sent
+from companion.io.transport import Connect, Event, PresenceChange, ReceivedSample, Request, Sent
 from companion.vehicle.agent import Agent
 from companion.vehicle.guard import Guard
 from companion.vehicle.outputs import Outputs
@@ -188,7 +189,8 @@ class Companion:
     def _receive_from_peers(self) -> list[Request]:
         """Hand on what peers said; returns what the operator asks, to be answered after the tick."""
         requests = []
-        for event in self.network.drain():
+        events: list[Event] = self.guard.transport("drain", self.network.drain, [])
+        for event in events:
             now = self._instant(event.received_monotonic_ns)
             match event:
                 case ReceivedSample():
@@ -212,7 +214,7 @@ class Companion:
             self.link.send(datagram)
         sent_ns = time.monotonic_ns()
         for topic, payload in out.peers:
-            self.network.publish(topic, payload)
+            self.guard.transport("publish", partial(self.network.publish, topic, payload), None)
         self._notifier.loop_turned(sent_ns)
         self._record_outputs(out, now)
         self._record_tick(out, now, sent_ns, deadline_ns)
@@ -301,7 +303,7 @@ class Companion:
             self._file_due_ns = now_ns + round(CONFIGURATION_S * 1e9)
             if self._configuration() != self._file:
                 self._notice(Failsafe.CONFIGURATION, now_ns)
-        sent = self.network.sent()
+        sent = self.guard.transport("sent", self.network.sent, self._sent[-1][1])
         self._sent.append((now_ns, sent))
         self._record("traffic", self._instant(now_ns), TrafficRecord(*sent).pack())
 

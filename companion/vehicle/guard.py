@@ -83,6 +83,10 @@ class Guard:
         """`Agent.stop`."""
         self._guarded("stop", lambda: self.agent.stop(now), None)
 
+    def transport(self, what: str, call: Callable[[], T], otherwise: T) -> T:
+        """A call of the transport to the peers: one that fails leaves the vehicle alone for that turn, and flying."""
+        return self._guarded(f"transport {what}", call, otherwise)
+
     def reply(self, kind: str, answer: Callable[[], bytes]) -> bytes | None:
         """An answer to a question of that kind, or None: whoever asked asks again."""
         return self._guarded(kind, answer, None)

@@ -26,6 +26,7 @@ from companion.io.transport import (
     PresenceChange,
     ReceivedSample,
     Request,
+    Sent,
 )
 from companion.io.zenoh.configuration import SessionSettings
 from companion.io.zenoh.operator import ZenohOperatorLink
@@ -189,6 +190,31 @@ def test_an_operator_sees_who_is_there_and_each_answers_once(network: Network) -
         assert operator.ask_timed([3], "status", b"?", timeout_s=0.1, retry_s=1.0) == {3: None}
 
 
+class FailingTransport(MemoryTransport):
+    """Raises so many times in each of its parts, when it is told to."""
+
+    def __init__(self, bus: Bus, vehicle_id: int, wake: Callable[[], None]) -> None:
+        super().__init__(bus, vehicle_id, wake)
+        self.failing: dict[str, int] = {}
+
+    def _fail(self, part: str) -> None:
+        if self.failing.get(part, 0) > 0:
+            self.failing[part] -= 1
+            raise RuntimeError(part)
+
+    def drain(self) -> list[Event]:
+        self._fail("drain")
+        return super().drain()
+
+    def publish(self, topic: str, payload: bytes) -> None:
+        self._fail("publish")
+        super().publish(topic, payload)
+
+    def sent(self) -> Sent:
+        self._fail("sent")
+        return super().sent()
+
+
 @pytest.mark.process
 @pytest.mark.timeout(200)
 def test_three_companions_in_one_process_fly_on_the_transport_in_memory(tmp_path: Path) -> None:
@@ -201,7 +227,7 @@ def test_three_companions_in_one_process_fly_on_the_transport_in_memory(tmp_path
     def companion(i: int) -> Companion:
         settings = RunSettings(i, tmp_path / f"{i}.mcap", log=lambda _: None)
         metadata = {"config": fleet.file.read_text()}
-        return Companion(fleet.config, settings, metadata, lambda wake: MemoryTransport(bus, i, wake))
+        return Companion(fleet.config, settings, metadata, lambda wake: FailingTransport(bus, i, wake))
 
     with ExitStack() as stack:
         stack.callback(os.close, end_read)
@@ -225,6 +251,10 @@ def test_three_companions_in_one_process_fly_on_the_transport_in_memory(tmp_path
         flying[1].network.inbox.count("reply_failures")  # type: ignore[attr-defined]
         told = wait_status(operator, lambda said: "peer: could not be sent" in said[1].rejected)[1].rejected
         assert (told["peer: could not be sent"], told["operator: could not be answered"]) == (1, 1)
+        flying[2].network.failing.update(drain=20, publish=1, sent=1)  # type: ignore[attr-defined]
+        raised = {f"raised: transport {part}: RuntimeError" for part in ("drain", "publish", "sent")}
+        said = wait_status(operator, lambda said: 2 in said and raised <= said[2].rejected.keys())
+        assert said[2].phase in SETTLED
         assert all((s.packets_hz or 0.0) > 0.0 and (s.bytes_per_s or 0.0) > 0.0 for s in said.values())
         assert operator.land().all_accepted
         wait_status(operator, all_in(fleet.ids, "landed"))
