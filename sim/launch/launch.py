@@ -141,7 +141,8 @@ class _Launch:
                     config = self._leave_out(tables, ids, missing)
                     continue
                 if not answers.all_accepted:
-                    raise RefusedError(answers.sentence("take-off"))
+                    gone = (self.processes.why_ended(f"companion-{i}", "at take-off") for i in watch.ended())
+                    raise RefusedError("\n".join((answers.sentence("take-off"), *gone)))
                 lost = watch.fly(self.options.duration_s, self.options.faults, self.interrupted)
                 autopilots_lost = {i: how for i, how in watch.autopilots_ended().items() if i in ids}
             self._end(ids)

@@ -43,8 +43,9 @@ class Met(NamedTuple):
 
 
 def tables() -> dict[str, Any]:
-    """The shipped fleet.toml with sixteen vehicles."""
-    read = tomllib.loads((ROOT / "fleet.toml").read_text(encoding="utf-8"))
+    """The fleet.toml that the tree ships, with sixteen vehicles: another tree may know other keys."""
+    shipped = Path(importlib.import_module("companion").__path__[0]).parent / "fleet.toml"
+    read = tomllib.loads(shipped.read_text(encoding="utf-8"))
     read["vehicle"] = [{"id": i} for i in range(1, VEHICLES + 1)]
     read["formation"]["altitude_m"] = 3.0
     return read
