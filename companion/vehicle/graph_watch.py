@@ -1,12 +1,12 @@
 """The graph in use as one vehicle sees it: how well it holds together, and a warning before it falls apart."""
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from itertools import combinations
 from math import dist
 
 from companion.core.events import Event, GraphNearBreaking
 from companion.core.frames import Ned
-from companion.core.neighbours.graph import Connectivity, Graph, among, connectivity
+from companion.core.neighbours.graph import Connectivity, Graph, among, connectivity_in_steps
 from companion.core.neighbours.table import PeerTable
 from companion.core.trajectory.fleet import FleetTrajectory
 from companion.core.values import Instant, Neighbour
@@ -26,22 +26,34 @@ class GraphWatch:
         self._id = vehicle_id
         self._peers = peers
         self._graph: Graph = {}
+        self._work: Generator[None, None, Connectivity] | None = None
+        """what is being reckoned of that graph"""
         self._due_ns = 0
 
     def look(
         self, plan: FleetTrajectory, here_ned_m: Ned, neighbours: Sequence[Neighbour], part: bool, now: Instant
     ) -> None:
-        """Look once a second; what has not changed is not reckoned again."""
-        if now.monotonic_ns < self._due_ns:
+        """Look once a second; what has changed is reckoned a step a tick, so that no setpoint waits for it."""
+        if now.monotonic_ns >= self._due_ns:
+            self._due_ns = now.monotonic_ns + PERIOD_NS
+            graph = self._seen(plan, here_ned_m, neighbours) if part else {}
+            if graph != self._graph:
+                self._graph = graph
+                self._work = connectivity_in_steps(graph) if len(graph) > 1 else None
+                if self._work is None:
+                    self.connectivity = None
+        if self._work is None:
             return
-        self._due_ns = now.monotonic_ns + PERIOD_NS
-        graph = self._seen(plan, here_ned_m, neighbours) if part else {}
-        if graph == self._graph:
-            return
-        self._graph = graph
+        try:
+            next(self._work)
+        except StopIteration as done:
+            self._work = None
+            self._found(done.value)
+
+    def _found(self, found: Connectivity) -> None:
         broke = self.connectivity is not None and self.connectivity.breaks
-        self.connectivity = found = connectivity(graph) if len(graph) > 1 else None
-        if found is not None and found.breaks and not broke:
+        self.connectivity = found
+        if found.breaks and not broke:
             self.events.append(GraphNearBreaking(found.edge, found.lambda2))
 
     def _seen(self, plan: FleetTrajectory, here_ned_m: Ned, neighbours: Sequence[Neighbour]) -> Graph:
