@@ -43,8 +43,8 @@ NOTICE_LOST_S = {"laptop": 4.0, "field": 2.0}
 closes no connection, a laptop's longer since an overloaded one holds its processes up"""
 KEEP_ALIVES = {"laptop": 4, "field": 2}
 """so many keep-alives a session sends in `peers.notice_lost_s` to a peer to which it sends nothing else. On a laptop
-that is one a second: they are most of an idle mesh's CPU (30 processes on two cores: 31 % of one core in all, 74 % with
-four a second). In the field each is a packet, and TCP repeats the one that is lost"""
+that is one a second: they are most of an idle mesh's CPU. In the field each is a packet, and TCP repeats the one that
+is lost"""
 PROCESS_END_S = 1.5
 """on a laptop processes end and no computer does: that is told within so long"""
 T_MAX_S = 10.0

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import itertools
-import json
 import os
 import signal
 import socket
-import subprocess
-import sys
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
-from dataclasses import asdict
+from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 from test_zenoh_peers import PATIENCE_S, Vehicle, eventually, read
+from zenoh_child import child
 
 from companion.config import FleetConfig
 from companion.config.file import parse
@@ -55,35 +52,6 @@ def field_fleet(ids: Sequence[int], notice_lost_s: float | None = LOST_S, networ
         "vehicle": [{"id": i, "zenoh": f"tcp/{host}:{port}"} for i, host in hosts.items()],
     }
     return parse(tables, "fleet.toml")
-
-
-CHILD = """
-import json, sys
-from companion.io.zenoh.configuration import SessionSettings
-from companion.io.zenoh.vehicle import ZenohTransport
-plain = json.loads(sys.argv[1])
-network = ZenohTransport(SessionSettings(**{k: tuple(v) if isinstance(v, list) else v for k, v in plain.items()}), lambda: None)
-network.open()
-network.publish("state", b"child")
-print("open", flush=True)
-sys.stdin.read()
-"""  # noqa: E501
-
-
-@contextmanager
-def child(config: FleetConfig, vehicle_id: int) -> Iterator[subprocess.Popen[str]]:
-    """Another process with that vehicle's session."""
-    settings = json.dumps(asdict(session_settings(config, vehicle_id)))
-    process = subprocess.Popen(
-        [sys.executable, "-c", CHILD, settings], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    )
-    with process:
-        try:
-            assert process.stdout is not None
-            assert process.stdout.readline() == "open\n"
-            yield process
-        finally:
-            process.kill()
 
 
 def of(config: FleetConfig, vehicle_id: int) -> Vehicle:
@@ -174,7 +142,7 @@ def test_a_killed_process_is_noticed_at_once_by_its_tcp_connection_and_is_back_s
     config = field_fleet([1, 2], notice_lost_s=10.0)
     one = of(config, mine)
     with one.network:
-        with child(config, killed) as process:
+        with child(session_settings(config, killed)) as process:
             one.wait_presence(killed, True)
             one.wait_message(f"fleet/{killed}/state", b"child")
             killed_ns = time.monotonic_ns()
@@ -182,7 +150,7 @@ def test_a_killed_process_is_noticed_at_once_by_its_tcp_connection_and_is_back_s
             one.wait_presence(killed, False)
             assert one.events[-1].received_monotonic_ns - killed_ns < 2_000_000_000
         one.events.clear()
-        with child(config, killed):
+        with child(session_settings(config, killed)):
             one.wait_message(f"fleet/{killed}/state", b"child")
             one.wait_presence(killed, True)
             assert one.presence()[-1] == (killed, True)
@@ -193,7 +161,7 @@ def test_a_killed_process_is_noticed_at_once_by_its_tcp_connection_and_is_back_s
 def test_one_whose_radio_is_gone_is_noticed_in_time_and_heard_again_after_it(mine: int, stopped: int) -> None:
     config = field_fleet([1, 2])
     one = of(config, mine)
-    with one.network, child(config, stopped) as process:
+    with one.network, child(session_settings(config, stopped)) as process:
         one.wait_presence(stopped, True)
         stopped_ns = time.monotonic_ns()
         process.send_signal(signal.SIGSTOP)  # says nothing, and closes nothing

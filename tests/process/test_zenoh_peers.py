@@ -6,8 +6,6 @@ import itertools
 import json
 import os
 import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -18,6 +16,7 @@ from typing import TypeVar
 import pytest
 import zenoh
 from zenoh.handlers import Callback
+from zenoh_child import child
 
 from companion.errors import ConfigError
 from companion.io.mailbox import BOUNDS, Bound
@@ -108,36 +107,6 @@ def paced(items: Iterable[T]) -> Iterator[T]:
     for item in items:
         yield item
         pause.wait(2.0 / PLANS_HZ)
-
-
-CHILD = """
-import sys
-from companion.io.zenoh.configuration import SessionSettings
-from companion.io.zenoh.vehicle import ZenohTransport
-network = ZenohTransport(SessionSettings(sys.argv[1], int(sys.argv[2])), lambda: None)
-network.open()
-network.publish("state", b"child")
-print("open", flush=True)
-"""
-
-
-@contextmanager
-def child(fleet: str, vehicle_id: int, then: str) -> Iterator[subprocess.Popen[str]]:
-    """Another process in the fleet that opens its network, says so and goes on with `then`."""
-    process = subprocess.Popen(
-        [sys.executable, "-c", CHILD + then, fleet, str(vehicle_id)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    with process:
-        try:
-            assert process.stdout is not None
-            assert process.stdout.readline() == "open\n"
-            yield process
-        finally:
-            process.kill()
 
 
 # Configuration
@@ -300,7 +269,7 @@ def test_two_fleets_of_different_names_on_one_port_do_not_hear_each_other(fleet:
 
 @pytest.mark.process
 def test_a_killed_process_is_seen_to_vanish_within_a_second(fleet: str) -> None:
-    with vehicle(fleet, 1) as one, child(fleet, 2, "sys.stdin.read()") as process:
+    with vehicle(fleet, 1) as one, child(SessionSettings(fleet, 2)) as process:
         one.wait_presence(2, True)
         one.wait_message("fleet/2/state", b"child")
         killed_ns = time.monotonic_ns()
@@ -545,7 +514,7 @@ def test_closing_tells_the_others_and_may_be_repeated(fleet: str) -> None:
     "ending", ["sys.exit(3)", "raise RuntimeError", "network.close()\nnetwork.close()\nsys.exit(3)"]
 )
 def test_the_interpreter_exits_at_once_whether_or_not_the_network_was_closed(fleet: str, ending: str) -> None:
-    with child(fleet, 1, ending) as process:
+    with child(SessionSettings(fleet, 1), ending) as process:
         assert process.wait(PATIENCE_S) in {1, 3}
 
 
@@ -558,7 +527,7 @@ def test_an_unknown_topic_is_our_own_bug(fleet: str) -> None:
 @pytest.mark.process
 @pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="reads Linux' socket tables")
 def test_a_laptops_vehicle_accepts_connections_on_loopback_only(fleet: str) -> None:
-    with child(fleet, 1, "sys.stdin.read()") as process:
+    with child(SessionSettings(fleet, 1)) as process:
         links = [os.readlink(entry) for entry in Path(f"/proc/{process.pid}/fd").iterdir()]
         inodes = {link[8:-1] for link in links if link.startswith("socket:[")}
         listening = [
