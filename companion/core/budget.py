@@ -31,9 +31,9 @@ class Bucket:
         self._left -= looks
 
 
-SENDER_LOOKS_PER_S, SENDER_LOOKS_MOST = 400.0, 1000.0
-ALL_LOOKS_PER_S, ALL_LOOKS_MOST = 1200.0, 2000.0
-"""a look is some 10 us of a fast core: about a hundredth of it goes to what is refused, however much of it comes"""
+SENDER_LOOKS_PER_S, SENDER_LOOKS_MOST = 250.0, 600.0
+ALL_LOOKS_PER_S, ALL_LOOKS_MOST = 750.0, 1200.0
+"""a look is some 15 us of a fast core: about a hundredth of it goes to what is refused, however much of it comes"""
 
 
 @dataclass(slots=True)

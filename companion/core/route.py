@@ -34,12 +34,12 @@ from companion.core.vectors import lerp
 
 RESOLUTION_M = 0.01
 """a breach between two looks that is no deeper than this may be missed"""
-LOOKS_MAX = 1400
+LOOKS_MAX = 400
 """most looks at a motion of up to ten vehicles; of more vehicles more, up to three times as many"""
-SLOT_LOOKS = 0.25
+SLOT_LOOKS = 0.1
 """cost of one slot's place over that of a look at the centre"""
-EDGE_LOOKS, NOTCHED_EDGE_LOOKS = 0.1, 0.25
-"""cost of one edge of a polygon over that of the place"""
+POLYGON_LOOKS, EDGE_LOOKS = 1.0, 0.001
+"""cost of asking about places beside a polygon, and of one of its edges for each place"""
 DEPTH_PARTS = 24
 """a leg that leads outside is looked at in so many parts, and its worst part again, to tell how far it leads"""
 DEPTH_SHARE = 0.3
@@ -149,7 +149,7 @@ def _aligned(a: Ned, b: Ned) -> bool:
 
 @dataclass
 class _Moment:
-    """The motion at one time, between two pieces of its way: what both ask of the slots there is computed once."""
+    """The motion at one time, between two pieces of its way: what both ask of it there is computed once."""
 
     fleet_ns: int
     motion: FleetTrajectory
@@ -157,19 +157,33 @@ class _Moment:
     state: TrajectoryState
 
     @cached_property
+    def centre_edge_room_m(self) -> float:
+        """Room of the centre to the edge."""
+        north, east, _ = self.state.centre.position
+        return self.fence.edge_rooms_m([(north, east)])[0]
+
+    @cached_property
     def places(self) -> list[Ned]:
         """Where the slots are."""
-        return [self.state.slot(change).position_ned_m for change in self.motion.slots.values()]
+        return [self.state.place(change) for change in self.motion.slots.values()]
 
     @cached_property
     def vertical_room_m(self) -> float:
         """Least room of any slot to floor and ceiling."""
-        return min(self.fence.vertical_room_m(p.down) for p in self.places)
+        downs = [p.down for p in self.places]
+        return min(self.fence.vertical_room_m(min(downs)), self.fence.vertical_room_m(max(downs)))
+
+    @cached_property
+    def rooms_m(self) -> list[float]:
+        """Room of each slot to the nearest margin."""
+        edge_rooms_m = self.fence.edge_rooms_m([(p.north, p.east) for p in self.places])
+        vertical_room_m = self.fence.vertical_room_m
+        return [min(room, vertical_room_m(p.down)) for room, p in zip(edge_rooms_m, self.places, strict=True)]
 
     @cached_property
     def room_m(self) -> float:
         """Least room of any slot."""
-        return min(self.fence.room_m(p) for p in self.places)
+        return min(self.rooms_m)
 
 
 @dataclass(slots=True)
@@ -190,6 +204,8 @@ class _March:
     _looks_max: float = field(init=False)
     _centre_cost: float = field(init=False)
     _slots_cost: float = field(init=False)
+    _end: _Moment | None = field(default=None, init=False)
+    """of the last span, where the next one begins"""
 
     def __post_init__(self) -> None:
         ends = [slot for change in self.motion.slots.values() for slot in change]
@@ -197,10 +213,11 @@ class _March:
         self._least_down_m, self._most_down_m = min(s.down for s in ends), max(s.down for s in ends)
         self._way_m = max(dist(*change) for change in self.motion.slots.values())
         count = len(self.motion.slots)
-        edges = len(self.fence.corners_m) * (EDGE_LOOKS if self.fence.convex else NOTCHED_EDGE_LOOKS)
+        edges = len(self.fence.corners_m)
+        asking = POLYGON_LOOKS if edges > 0 else 0.0
         self._looks_max = LOOKS_MAX * min(max(count / 10.0, 1.0), 3.0)
-        self._centre_cost = 1.0 + SLOT_LOOKS * edges
-        self._slots_cost = SLOT_LOOKS * count * (1.0 + edges)
+        self._centre_cost = 1.0 + asking + EDGE_LOOKS * edges
+        self._slots_cost = SLOT_LOOKS * count + asking + EDGE_LOOKS * edges * count
 
     @property
     def exhausted(self) -> bool:
@@ -209,14 +226,8 @@ class _March:
 
     def least_room(self, fleet_ns: int) -> tuple[float, int]:
         """Least room of any slot at a time, and the vehicle that has it."""
-        moment = self.motion.state_at(fleet_ns)
         self.looks += self._slots_cost
-        least, vehicle = inf, 0
-        for i, change in self.motion.slots.items():
-            room = self.fence.room_m(moment.slot(change).position_ned_m)
-            if room < least:
-                least, vehicle = room, i
-        return least, vehicle
+        return min(zip(self._moment(fleet_ns).rooms_m, self.motion.slots, strict=True))
 
     def _bend_m_s2(self, span: _Span, start_ns: int, end_ns: int) -> float:
         """No slot's acceleration is greater between two times of a span; 0 where all ways are straight."""
@@ -233,7 +244,9 @@ class _March:
 
     def inside(self, span: _Span) -> bool:
         """Whether every slot stays inside over a span; also False once the looks are used up."""
-        stack = [(self._moment(span.start_ns), self._moment(span.end_ns))]
+        start = self._moment(span.start_ns)
+        self._end = self._moment(span.end_ns)
+        stack = [(start, self._end)]
         while stack:
             first, last = stack.pop()
             start_ns, end_ns = first.fleet_ns, last.fleet_ns
@@ -242,46 +255,48 @@ class _March:
                 return False
             seconds = (end_ns - start_ns) * 1e-9
             strip = 0.125 * self._bend_m_s2(span, start_ns, end_ns) * seconds * seconds
-            if self._all_inside(first.state, last.state, strip):
+            if self._all_inside(first, last, strip):
                 continue
+            self.looks += self._slots_cost
+            if not min(first.room_m, last.room_m) >= self.allowed_m:
+                return False
             least, wide = self._slots_inside(first, last, strip)
             if least >= self.allowed_m:
                 continue
-            self.looks += self._slots_cost
-            if not (first.room_m >= self.allowed_m and last.room_m >= self.allowed_m):
-                return False
             middle_ns = (start_ns + end_ns) // 2
             if wide > RESOLUTION_M and start_ns < middle_ns < end_ns:
                 middle = self._moment(middle_ns)
                 stack += [(middle, last), (first, middle)]
         return True
 
-    def _all_inside(self, first: TrajectoryState, last: TrajectoryState, strip: float) -> bool:
+    def _all_inside(self, first: _Moment, last: _Moment, strip: float) -> bool:
         """Whether a strip about the centre's way that is wide enough for every slot is inside."""
-        a, b = first.centre.position, last.centre.position
+        a, b = first.state.centre.position, last.state.centre.position
         fence, need = self.fence, self.allowed_m + strip
-        return (
-            min(
-                fence.vertical_room_m(a.down + self._least_down_m), fence.vertical_room_m(a.down + self._most_down_m),
-                fence.vertical_room_m(b.down + self._least_down_m), fence.vertical_room_m(b.down + self._most_down_m),
-            ) >= need
-            and fence.edge_room_along_m(a.north, a.east, b.north, b.east) - self._level_m >= need
-        )  # fmt: skip
+        lowest, highest = max(a.down, b.down) + self._most_down_m, min(a.down, b.down) + self._least_down_m
+        if fence.lowest_down_m - lowest < need or highest - fence.highest_down_m < need:
+            return False
+        if fence.convex:
+            room = min(first.centre_edge_room_m, last.centre_edge_room_m)
+        else:
+            room = fence.edge_rooms_along_m([((a.north, a.east), (b.north, b.east))])[0]
+        return room - self._level_m >= need
 
-    def _moment(self, fleet_ns: int) -> "_Moment":
+    def _moment(self, fleet_ns: int) -> _Moment:
+        if self._end is not None and self._end.fleet_ns == fleet_ns:
+            return self._end
         return _Moment(fleet_ns, self.motion, self.fence, self.motion.state_at(fleet_ns))
 
-    def _slots_inside(self, first: "_Moment", last: "_Moment", strip: float) -> tuple[float, float]:
+    def _slots_inside(self, first: _Moment, last: _Moment, strip: float) -> tuple[float, float]:
         """Least room of the strips about the slots' ways, and how wide or (beside a notch) how long what may be halved
         is."""
-        self.looks += 2.0 * self._slots_cost
-        convex, edge_room_along_m = self.fence.convex, self.fence.edge_room_along_m
-        least, wide = min(first.vertical_room_m, last.vertical_room_m), strip
-        for a, b in zip(first.places, last.places, strict=True):
-            least = min(least, edge_room_along_m(a.north, a.east, b.north, b.east))
-            if not convex:
-                wide = max(wide, hypot(b.north - a.north, b.east - a.east))
-        return least - strip, wide
+        if self.fence.convex:
+            # On a straight way the least room is that at one of its ends.
+            return min(first.room_m, last.room_m) - strip, strip
+        self.looks += self._slots_cost
+        ways = [((a.north, a.east), (b.north, b.east)) for a, b in zip(first.places, last.places, strict=True)]
+        least = min(first.vertical_room_m, last.vertical_room_m, *self.fence.edge_rooms_along_m(ways))
+        return least - strip, max(strip, *(dist(a, b) for a, b in ways))
 
     def deepest(self, spans: list[_Span]) -> Breach | None:
         """How far the spans of one leg lead outside at most."""

@@ -97,7 +97,7 @@ class Examination(NamedTuple):
 
     fault: Fault | None
     looks: float
-    """what it cost: a look is some 10 µs of a fast core"""
+    """what it cost: a look is some 15 µs of a fast core"""
 
 
 def _form_fault(motion: FleetTrajectory) -> Fault | None:
@@ -242,17 +242,17 @@ def examine(motion: FleetTrajectory, limits: MotionLimits, before: FleetTrajecto
     """
     if before is not None and before.slots.keys() != motion.slots.keys():
         return Examination(Fault(RefusalKind.VEHICLES, "its vehicles are not this fleet's"), 1.0)
-    looks = 1.0 + 0.25 * len(motion.legs)
+    looks = 1.0 + 0.5 * len(motion.legs)
     stops = before is not None and only_stops(motion, before)
     fault = _form_fault(motion) or _speed_fault(motion, limits)
     if fault is None and not stops:
         fault = _altitude_fault(motion)
     if fault is None:
         fault, times = _slots_fault(motion, limits, STOP_SLACK if stops else SPEED_SLACK)
-        looks += 1.5 * times
+        looks += times
     if fault is None and (before is None or not slots_continue(motion, before, SLOTS_TOLERANCE_M)):
         apart_m = slots_apart_m(motion)
-        looks += 0.1 * len(motion.slots) ** 2
+        looks += 0.05 * len(motion.slots) ** 2
         if not apart_m >= limits.slots_apart_m:
             sentence = (
                 f"its slots come within {apart_m:.2f} m of each other, must stay {limits.slots_apart_m:.2f} m apart"

@@ -32,7 +32,7 @@ PROPOSAL_SPREAD_NS = 100_000_000
 START_FROM_NOW_MAX_NS = 3_600_000_000_000
 OUT_OF_FORMATION = frozenset({Phase.IDLE, Phase.DETACHED, Phase.LANDING, Phase.LANDED, Phase.RELEASED})
 """phases of peers for which nobody waits any more once the formation has been taken"""
-COMMAND_LOOKS_PER_S, COMMAND_LOOKS_MOST = 400.0, 2000.0
+COMMAND_LOOKS_PER_S, COMMAND_LOOKS_MOST = 250.0, 1200.0
 """what examining commanded trajectories may cost (`core.budget`)"""
 DECODING_LOOKS_PER_BYTE = 0.002
 REFUSED_KEPT = 8

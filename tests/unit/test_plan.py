@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from companion.core.formation import shape_slots
 from companion.core.frames import Ned
 from companion.core.trajectory.fleet import FleetTrajectory
-from companion.core.trajectory.goto import goto_duration_s
+from companion.core.trajectory.goto import goto_duration_s, goto_peaks
 from companion.core.trajectory.history import TrajectoryHistory
 from companion.core.trajectory.legs import (
     PLAN_ACCELERATION_M_S2,
@@ -231,6 +231,21 @@ def test_an_endless_turn_is_a_circle_for_hours() -> None:
         assert dist(m.state_at(ns(10.0 + laps * lap)).centre.position, first) < 1e-4
     across = m.state_at(ns(10.0 + lap / 2)).centre.position
     assert dist(first, across) == pytest.approx(20.0, abs=1e-6)
+
+
+@PROPERTY
+@given(motions, st.floats(-5.0, 100.0))
+def test_a_slots_place_alone_is_the_place_of_the_whole_slot(m: FleetTrajectory, t_s: float) -> None:
+    now = m.state_at(ns(t_s))
+    assert all(now.place(change) == now.slot(change).position_ned_m for change in m.slots.values())
+
+
+@PROPERTY
+@given(places, places, st.floats(1.0, 60.0))
+def test_a_goto_from_rest_is_as_fast_as_it_is_looked_at(start: Ned, target: Ned, duration_s: float) -> None:
+    leg = GotoLeg(target, duration_s)
+    rest, hardly = goto_peaks(leg, start, ZERO), goto_peaks(leg, start, Ned(1e-12, 0.0, 0.0))
+    assert rest == pytest.approx(hardly, rel=1e-4, abs=1e-9)
 
 
 def test_slots_turn_with_the_heading_only_if_it_follows() -> None:

@@ -218,7 +218,7 @@ def test_the_least_room_along_a_straight_way_is_what_dense_sampling_finds(
     a: tuple[float, float], b: tuple[float, float], fence: Fence
 ) -> None:
     sampled = min(fence.edge_room_m(*(p + (q - p) * k / 400 for p, q in zip(a, b, strict=True))) for k in range(401))
-    least = fence.edge_room_along_m(*a, *b)
+    least = fence.edge_rooms_along_m([(a, b)])[0]
     if sampled < 0.0:
         assert least < 0.5
     if least < -fence.margin_m:
@@ -226,6 +226,19 @@ def test_the_least_room_along_a_straight_way_is_what_dense_sampling_finds(
     if min(sampled, least) >= 0.0:
         assert least == pytest.approx(sampled, abs=0.5)
         assert least <= sampled + 1e-9
+
+
+@given(st.lists(within, min_size=1, max_size=4), st.sampled_from([FENCE, NOTCHED, OCTAGON, Fence(2.0, 50.0)]))
+def test_rooms_of_many_places_are_each_ones(places: list[tuple[float, float]], fence: Fence) -> None:
+    rooms = fence.edge_rooms_m(places)
+    assert rooms == pytest.approx([fence.edge_room_m(*place) for place in places], abs=1e-9)
+
+
+def test_a_way_that_touches_the_edge_has_no_room_even_without_a_margin() -> None:
+    bare = replace(NOTCHED, margin_m=0.0)
+    assert bare.edge_rooms_along_m([((-50.0, 0.0), (60.0, -6.0)), ((30.0, -20.0), (30.0, 20.0))]) == [-inf, -inf]
+    assert bare.edge_rooms_along_m([((-50.0, 0.0), (-50.0, 0.0))]) == [pytest.approx(10.0)]
+    assert bare.edge_rooms_along_m([((-50.0, 0.0), (-50.0, 1e-290))]) == [pytest.approx(10.0)]
 
 
 def test_only_a_notch_makes_a_fence_that_is_not_convex() -> None:

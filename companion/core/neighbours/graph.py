@@ -9,7 +9,7 @@ with which those that are joined come to agree, in units of one neighbour's.
 """
 
 from collections.abc import Generator, Mapping, Set
-from math import dist, sqrt
+from math import dist, fsum, sqrt
 from typing import Literal, NamedTuple, cast
 
 from companion.core.frames import Ned
@@ -69,10 +69,10 @@ def connectivity_in_steps(graph: Graph) -> Generator[None, None, Connectivity]:
     for _ in range(INVERSE_STEPS if whole else 0):
         yield
         y = _across(_solved(graph, x))
-        norm = sqrt(sum(v * v for v in y.values()))
+        norm = sqrt(fsum(v * v for v in y.values()))
         x = {i: v / norm for i, v in y.items()}
     lx = _laplacian(graph, x)
-    lambda2 = sum(x[i] * lx[i] for i in ids) if whole else 0.0
+    lambda2 = fsum(x[i] * lx[i] for i in ids) if whole else 0.0
     breaks = not whole
     for i in ids if len(ids) > 2 else ():
         if breaks:
@@ -84,27 +84,27 @@ def connectivity_in_steps(graph: Graph) -> Generator[None, None, Connectivity]:
 
 def _across(x: Mapping[int, float]) -> dict[int, float]:
     """Without its mean."""
-    mean = sum(x.values()) / len(x)
+    mean = fsum(x.values()) / len(x)
     return {i: v - mean for i, v in x.items()}
 
 
 def _laplacian(graph: Graph, x: Mapping[int, float]) -> dict[int, float]:
-    return {i: len(graph[i]) * v - sum(x[j] for j in graph[i]) for i, v in x.items()}
+    return {i: len(graph[i]) * v - fsum(x[j] for j in graph[i]) for i, v in x.items()}
 
 
 def _solved(graph: Graph, b: Mapping[int, float]) -> dict[int, float]:
     """L y = b by conjugate gradients, for b without mean and a connected graph."""
     y, r = dict.fromkeys(b, 0.0), dict(b)
-    p, rr = dict(r), sum(v * v for v in r.values())
+    p, rr = dict(r), fsum(v * v for v in r.values())
     least = 1e-16 * rr
     for _ in range(len(b)):
         if rr <= least:
             break
         lp = _laplacian(graph, p)
-        step = rr / sum(p[i] * lp[i] for i in p)
+        step = rr / fsum(p[i] * lp[i] for i in p)
         y = {i: v + step * p[i] for i, v in y.items()}
         r = {i: v - step * lp[i] for i, v in r.items()}
-        before, rr = rr, sum(v * v for v in r.values())
+        before, rr = rr, fsum(v * v for v in r.values())
         p = {i: v + rr / before * p[i] for i, v in r.items()}
     return y
 

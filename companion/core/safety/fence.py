@@ -1,4 +1,6 @@
-"""The fence: a cylinder or a polygon over the ground, with a floor and a ceiling. Plain floats, no library.
+"""The fence: a cylinder or a polygon over the ground, with a floor and a ceiling.
+
+What is asked at every tick is plain floats; what is asked of many places at once takes a library for a polygon.
 
 `clearance_m` is the distance to the nearest limit, negative outside: whether a vehicle is where it may be. `room_m` is
 what is left of it to the margins: where a vehicle may be sent. The safety filter keeps the margins by a barrier on each
@@ -10,13 +12,16 @@ With h >= 0 and p h + h' >= 0 at the start, h never becomes negative. A vehicle 
 barrier 2 v/p before the margin and brakes with p v/e at most.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from math import e, hypot, inf, isfinite, sqrt
-from typing import NamedTuple
+from math import dist, e, hypot, inf, isfinite
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 from companion.core.frames import Ned
+
+if TYPE_CHECKING:
+    from shapely import LinearRing, Polygon
 
 FENCE_POLE_PER_S = 1.5
 """slower than the peers': a vehicle with 0.3 s of lag and 0.1 s of delay overshoots the less, 0.5 m at 4 m/s"""
@@ -24,6 +29,10 @@ BRAKING_SHARE = 0.5
 """part of the avoidance acceleration with which the barrier brakes at the speed limit; gusts and lag have the rest"""
 RETURN_SPEED_M_S = 1.0
 """how fast a vehicle beyond the margin is driven back"""
+
+
+SHORTEST_WAY_M = 1e-9
+"""a shorter way is a place"""
 
 
 class Wall(NamedTuple):
@@ -69,6 +78,17 @@ class Fence:
                 edges.append((a[0], a[1], (b[0] - a[0]) / length, (b[1] - a[1]) / length, length))
         return tuple(edges)
 
+    @cached_property
+    def _polygon(self) -> "tuple[Polygon, LinearRing]":
+        """What is inside of the corners, and its edge, made ready for many questions."""
+        # Only here: a companion without a polygon need not load it.
+        import shapely
+
+        polygon = shapely.Polygon(self.corners_m)
+        edge = polygon.exterior
+        shapely.prepare([polygon, edge])
+        return polygon, edge
+
     def _feet(self, north: float, east: float) -> Iterator[tuple[float, float, float, float, float]]:
         """Of each edge: distance, vector from its nearest point to the place, and its normal into the fence."""
         for a_north, a_east, d_north, d_east, length in self._edges:
@@ -103,48 +123,33 @@ class Fence:
         edges = self._edges
         return all(a[2] * b[3] - a[3] * b[2] >= -1e-12 for a, b in zip(edges, (*edges[1:], *edges[:1]), strict=True))
 
-    def edge_room_along_m(self, a_north: float, a_east: float, b_north: float, b_east: float) -> float:
-        """Least room to the edge's margin on the straight way from a to b; minus infinity where the way leads over the
-        edge of a polygon with notches, or begins outside it."""
-        if self._edges and not self.convex:
-            return self._notched_room_along_m(a_north, a_east, b_north, b_east)
-        if self._edges:
-            # Inside, the nearest edge is that whose line is nearest; outside, the line is no further than the edge.
-            least = inf
-            for c_north, c_east, d_north, d_east, _ in self._edges:
-                a = (a_east - c_east) * d_north - (a_north - c_north) * d_east
-                b = (b_east - c_east) * d_north - (b_north - c_north) * d_east
-                least = min(least, a, b)
-            if least >= 0.0:
-                return least - self.margin_m
-        return min(self.edge_room_m(a_north, a_east), self.edge_room_m(b_north, b_east))
+    def edge_rooms_m(self, places: Sequence[tuple[float, float]]) -> list[float]:
+        """`edge_room_m` of many places (north, east), at little more than the cost of one where the edge has many
+        corners."""
+        if not self._edges:
+            return [self.edge_room_m(*place) for place in places]
+        import numpy as np
+        import shapely
 
-    def _notched_room_along_m(self, a_north: float, a_east: float, b_north: float, b_east: float) -> float:
-        """Two ways that do not cross are nearest at an end of one of them."""
-        way_north, way_east = b_north - a_north, b_east - a_east
-        way2 = way_north * way_north + way_east * way_east
-        least2, within = inf, False
-        for c_north, c_east, d_north, d_east, length in self._edges:
-            ax, ay = a_north - c_north, a_east - c_east
-            bx, by = b_north - c_north, b_east - c_east
-            a_along, b_along = ax * d_north + ay * d_east, bx * d_north + by * d_east
-            a_left, b_left = ay * d_north - ax * d_east, by * d_north - bx * d_east
-            if (a_left > 0.0) != (b_left > 0.0):
-                crossing = a_along + a_left / (a_left - b_left) * (b_along - a_along)
-                if 0.0 <= crossing <= length:
-                    return -inf
-            end_east = c_east + length * d_east
-            if (c_east > a_east) != (end_east > a_east) and a_north < c_north + (a_east - c_east) * d_north / d_east:
-                within = not within
-            beyond = a_along - min(max(a_along, 0.0), length)
-            least2 = min(least2, beyond * beyond + a_left * a_left)
-            beyond = b_along - min(max(b_along, 0.0), length)
-            least2 = min(least2, beyond * beyond + b_left * b_left)
-            # The edge's start from the way; its end is the next edge's start.
-            share = min(max(-(ax * way_north + ay * way_east) / way2, 0.0), 1.0) if way2 > 0.0 else 0.0
-            x, y = ax + share * way_north, ay + share * way_east
-            least2 = min(least2, x * x + y * y)
-        return sqrt(least2) - self.margin_m if within else -inf
+        polygon, edge = self._polygon
+        distance = shapely.distance(edge, shapely.points(places))
+        within = shapely.contains_xy(polygon, places)
+        return cast(list[float], (np.where(within, distance, -distance) - self.margin_m).tolist())
+
+    def edge_rooms_along_m(self, ways: Sequence[tuple[tuple[float, float], tuple[float, float]]]) -> list[float]:
+        """Least room to the edge's margin on each straight way; minus infinity for one that leads over the edge of a
+        polygon, or begins outside it."""
+        if not self._edges:
+            return [min(self.edge_room_m(*a), self.edge_room_m(*b)) for a, b in ways]
+        import numpy as np
+        import shapely
+
+        polygon, edge = self._polygon
+        # The square of a length much shorter than this would vanish, and shapely would divide by it.
+        lines = [(a, b if dist(a, b) > SHORTEST_WAY_M else a) for a, b in ways]
+        distance = shapely.distance(edge, shapely.linestrings(lines))
+        within = shapely.contains_xy(polygon, [a for a, _ in ways])
+        return cast(list[float], np.where(within & (distance > 0.0), distance - self.margin_m, -inf).tolist())
 
     def clearance_m(self, position_ned_m: Ned) -> float:
         """Distance to the nearest of edge, floor and ceiling; negative outside."""
@@ -172,12 +177,12 @@ class Fence:
         north, east, down = position_ned_m
         return min(self.edge_room_m(north, east), self.vertical_room_m(down))
 
-    @property
+    @cached_property
     def highest_down_m(self) -> float:
         """Down of the ceiling's margin."""
         return self.vertical_margin_m - self.ceiling_m
 
-    @property
+    @cached_property
     def lowest_down_m(self) -> float:
         """Down of the floor's margin."""
         return -self.vertical_margin_m - self.floor_m

@@ -56,6 +56,15 @@ class TrajectoryState(NamedTuple):
     blend: tuple[float, float, float]
     """part of the way from the slots before to those after, its rate (1/s) and the rate's change (1/s^2)"""
 
+    def place(self, change: SlotChange) -> Ned:
+        """p_ref,i alone."""
+        p, c, s, m = self.centre.position, self.cosine, self.sine, self.blend[0]
+        (f0, r0, d0), (f1, r1, d1) = change
+        forward, right = f0 + m * (f1 - f0), r0 + m * (r1 - r0)
+        return new(
+            Ned, (p.north + (c * forward - s * right), p.east + (s * forward + c * right), p.down + d0 + m * (d1 - d0))
+        )
+
     def slot(self, change: SlotChange) -> Reference:
         """p_ref,i = c + R(psi) D_i and its derivatives."""
         (p, v, a, _, _, _), heading, c, s, rate, bend, (m, m1, m2) = self

@@ -1,11 +1,12 @@
 """How long a leg to a point takes within given speeds, and how fast it is flown."""
 
-from math import inf, sqrt
+from math import hypot, inf, sqrt
 from typing import NamedTuple
 
 from companion.core.frames import Ned
 from companion.core.trajectory.legs import PLAN_ACCELERATION_M_S2, GotoLeg
-from companion.core.trajectory.polynomials import fading, minimum_jerk
+from companion.core.trajectory.polynomials import MINIMUM_JERK_BEND, fading, minimum_jerk
+from companion.core.values import ZERO
 
 GOTO_ACCELERATION_M_S2 = 2 * PLAN_ACCELERATION_M_S2
 """the largest acceleration of a goto leg, and of slots that change places"""
@@ -87,6 +88,12 @@ def goto_peaks(leg: GotoLeg, start: Ned, velocity: Ned) -> GotoPeaks:
     per_s = 1.0 / leg.duration_s
     n, e, d = ((b - a) * per_s for a, b in zip(start, leg.target_ned_m, strict=True))
     vn, ve, vd = velocity
+    if velocity == ZERO:
+        # Straight, so that where it is fastest and where it bends most are known.
+        fastest, bend = minimum_jerk(0.5)[1], MINIMUM_JERK_BEND * per_s
+        return GotoPeaks(
+            fastest * hypot(n, e), max(-fastest * d, 0.0), max(fastest * d, 0.0), bend * sqrt(n * n + e * e + d * d)
+        )
     level2, climb, descent, bend2 = vn * vn + ve * ve, max(-vd, 0.0), max(vd, 0.0), 0.0
     for m1, m2, f1, f2 in _GOTO_SAMPLES:
         x, y, z = n * m1 + vn * f1, e * m1 + ve * f1, d * m1 + vd * f1

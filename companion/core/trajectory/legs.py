@@ -209,10 +209,15 @@ def _goto_leg(leg: GotoLeg, p0: Ned, v0: Ned, t: float) -> CentreState:
     x = min(t / whole, 1.0)
     m, m1, m2 = minimum_jerk(x)
     f, f1, f2 = fading(x)
-    way = Ned(*(b - a for a, b in zip(p0, leg.target_ned_m, strict=True)))
+    (pn, pe, pd), (tn, te, td), (vn, ve, vd) = p0, leg.target_ned_m, v0
+    n, e, d = tn - pn, te - pe, td - pd
     return CentreState(
-        Ned(*(p + d * m + v * whole * f for p, d, v in zip(p0, way, v0, strict=True))),
-        Ned(*(d * m1 / whole + v * f1 for d, v in zip(way, v0, strict=True))),
-        Ned(*(d * m2 / whole**2 + v * f2 / whole for d, v in zip(way, v0, strict=True))),
+        Ned(pn + n * m + vn * whole * f, pe + e * m + ve * whole * f, pd + d * m + vd * whole * f),
+        Ned(n * m1 / whole + vn * f1, e * m1 / whole + ve * f1, d * m1 / whole + vd * f1),
+        Ned(
+            n * m2 / whole**2 + vn * f2 / whole,
+            e * m2 / whole**2 + ve * f2 / whole,
+            d * m2 / whole**2 + vd * f2 / whole,
+        ),
         0.0, 0.0, 0.0,
     )  # fmt: skip
