@@ -10,7 +10,7 @@ from companion.config.file import parse
 from companion.core.failsafe import Failsafe
 from companion.core.values import Instant
 from companion.errors import CompanionError
-from companion.io.recorder import Entry, Gap, Recording, RecordingError, gap_between, read_recording
+from companion.io.recording import Entry, Gap, Recording, RecordingError, gap_between, read_recording
 from companion.io.records import peer_body, split_peer_body
 from companion.vehicle.agent import Agent
 from companion.vehicle.guard import Guard

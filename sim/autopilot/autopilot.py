@@ -16,16 +16,8 @@ from companion.core.frames import Geodetic, Ned, ned_to_geodetic
 from companion.wire.mavlink_frames import is_one_frame
 from sim.autopilot.commander import HOME_SET_NS, Commander, Result, TakeoffState
 from sim.autopilot.commands import CommandRequest, answer, set_mode
-from sim.autopilot.dynamics import (
-    HOLD_STILL,
-    DynamicsParameters,
-    GustParameters,
-    NoiseParameters,
-    OrnsteinUhlenbeck,
-    Setpoint,
-    Vehicle,
-    normals,
-)
+from sim.autopilot.disturbances import GustParameters, NoiseParameters, OrnsteinUhlenbeck, normals
+from sim.autopilot.dynamics import HOLD_STILL, DynamicsParameters, Setpoint, Vehicle
 from sim.autopilot.estimator import Estimator
 from sim.autopilot.events import EventReporter
 from sim.autopilot.faults import LASTING, Fault, FaultKind

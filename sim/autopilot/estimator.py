@@ -3,7 +3,8 @@
 import math
 import random
 
-from sim.autopilot.dynamics import GRAVITY_M_S2, NoiseParameters, OrnsteinUhlenbeck, Vehicle, normals
+from sim.autopilot.disturbances import NoiseParameters, OrnsteinUhlenbeck, normals
+from sim.autopilot.dynamics import GRAVITY_M_S2, Vehicle
 from sim.autopilot.telemetry import Telemetry
 
 NO_AID_TIMEOUT_NS = 5_000_000_000

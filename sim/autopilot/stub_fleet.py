@@ -9,7 +9,8 @@ from companion.config.derived import Vehicle
 from companion.config.endpoints import autopilot_port, companion_port, udp_endpoint
 from companion.core.frames import Ned
 from companion.errors import ConfigError
-from sim.autopilot.dynamics import DynamicsParameters, GustParameters, NoiseParameters
+from sim.autopilot.disturbances import GustParameters, NoiseParameters
+from sim.autopilot.dynamics import DynamicsParameters
 from sim.autopilot.parameters import defaults
 from sim.autopilot.stubs import StubFleetSettings, StubVehicleSettings
 

@@ -14,9 +14,10 @@ from companion.errors import CompanionError
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("companion", "sim")
 MODULES = (
-    "sim/autopilot/dynamics.py", "sim/autopilot/autopilot.py", "sim/lockstep/lockstep.py", "sim/lockstep/network.py",
+    "sim/lockstep/lockstep.py", "sim/lockstep/network.py",
     *(f"sim/autopilot/{name}.py" for name in (
-        "commander", "estimator", "events", "link", "navigator", "offboard", "parameters", "services", "telemetry",
+        "autopilot", "commander", "disturbances", "dynamics", "estimator", "events", "link", "navigator", "offboard",
+        "parameters", "services", "telemetry",
     )),
     *(f"companion/core/{name}.py" for name in (
         "estimate", "frames", "law/base", "law/starling", "prediction", "safety/filter", "trigger/base",

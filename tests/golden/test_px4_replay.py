@@ -9,7 +9,7 @@ Whoever changes what the agent says on purpose records it anew, in the repositor
 from collections import Counter
 from pathlib import Path
 
-from companion.io.recorder import read_recording
+from companion.io.recording import read_recording
 from companion.io.replay import replay_file
 
 RECORDING = Path(__file__).parent / "px4_flight.mcap"

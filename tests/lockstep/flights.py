@@ -15,7 +15,7 @@ from pymavlink.dialects.v20 import development as dialect
 from companion.config import FleetConfig, load
 from companion.core.trajectory.history import TrajectoryHistory
 from companion.core.values import Instant, Phase
-from companion.io.recorder import Entry
+from companion.io.recording import Entry
 from companion.wire.operator import encode
 from sim.lockstep.lockstep import UTC_AT_START_NS, Lockstep
 from sim.lockstep.network import NetworkParameters

@@ -16,7 +16,8 @@ from flights import DEFAULT, READY_S, Tape, launch
 from companion.config import FleetConfig
 from companion.config.file import parse, read_tables
 from companion.core.values import Instant
-from companion.io.recorder import Recorder, RecordingError, read_recording
+from companion.io.recorder import Recorder
+from companion.io.recording import RecordingError, read_recording
 from companion.io.replay import ReplayResult, replay_file
 from sim.autopilot.stubs import TRUTH_DTYPE
 from sim.launch.summary.flight import Flight

@@ -51,7 +51,7 @@ from companion.core.events import KillCause
 from companion.core.failsafe import Failsafe
 from companion.core.frames import Ned
 from companion.core.values import PeerMessage, PeerSample, Phase
-from companion.io.recorder import read_recording
+from companion.io.recording import read_recording
 from companion.io.replay import replay_file
 from companion.io.zenoh.configuration import (
     PLANS_HZ,

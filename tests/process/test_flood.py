@@ -20,7 +20,7 @@ from fleet_process import wait_status as wait_for
 from fuzz_inputs import Inputs
 
 from companion.core.trajectory.fleet import FleetTrajectory
-from companion.io.recorder import read_recording
+from companion.io.recording import read_recording
 from companion.io.records import TickRecord
 from companion.io.replay import replay_file
 from companion.io.zenoh.configuration import session_settings, zenoh_configuration

@@ -15,7 +15,7 @@ import zenoh
 from fleet_process import SETTLED, all_in, eventually, flight_folder, make_fleet, operator_of, started, wait_status
 from zenoh.handlers import Callback
 
-from companion.io.recorder import read_recording
+from companion.io.recording import read_recording
 from companion.io.records import TickRecord
 from companion.io.zenoh.configuration import SessionSettings, zenoh_configuration
 from sim.launch.reference_loop import read_reference_loop

@@ -8,7 +8,7 @@ import pytest
 from fleet_process import flight_folder, make_fleet, run
 from foreign import EXAMPLE, install
 
-from companion.io.recorder import read_recording
+from companion.io.recording import read_recording
 from companion.io.replay import replay_file
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(400)]

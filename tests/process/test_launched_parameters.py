@@ -11,7 +11,7 @@ import tomli_w
 from fake_px4 import VERSION, fake_build
 from fleet_process import flight_folder, run
 
-from companion.io.recorder import read_recording
+from companion.io.recording import read_recording
 from sim.autopilot.stubs import TRUTH_DTYPE
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(400)]

@@ -20,7 +20,7 @@ from companion.errors import CompanionError
 from companion.io.link import SERIAL_UNSENT_MOST, SerialLink
 from companion.wire.mavlink_frames import FrameSplitter
 from sim.autopilot.autopilot import Autopilot
-from sim.autopilot.dynamics import GustParameters, NoiseParameters
+from sim.autopilot.disturbances import GustParameters, NoiseParameters
 from sim.autopilot.parameters import defaults
 from sim.autopilot.stub_fleet import FLEET_PARAMETERS
 

@@ -16,7 +16,7 @@ from fleet_process import SETTLED, all_in, make_fleet, wait_status
 from memory_transport import Bus, MemoryOperatorLink, MemoryTransport
 
 from companion.io.loop import Companion, RunSettings
-from companion.io.recorder import read_recording
+from companion.io.recording import read_recording
 from companion.io.replay import replay_file
 from companion.io.transport import (
     PAYLOAD_MAX_BYTES,

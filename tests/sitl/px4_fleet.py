@@ -17,7 +17,7 @@ from fleet_process import Fleet, Process, flight_folder, make_fleet, operator_of
 from pymavlink.dialects.v20 import development as dialect
 
 from companion.core.trajectory.history import TrajectoryHistory
-from companion.io.recorder import read_recording
+from companion.io.recording import read_recording
 from companion.operator.client import Operator
 from companion.wire.operator import Status
 from companion.wire.px4 import Px4Mode, mode_parameters

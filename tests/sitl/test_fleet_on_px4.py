@@ -12,7 +12,7 @@ from fleet_process import child, children, eventually, gone, run
 from px4_fleet import PATIENCE_S, flying, sitl_fleet
 
 from companion.core.frames import Ned, ned_to_geodetic
-from companion.io.recorder import read_recording
+from companion.io.recording import read_recording
 from companion.wire.px4 import Px4Mode
 from sim.launch.px4_instance import Px4Instance
 

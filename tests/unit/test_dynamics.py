@@ -12,17 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim.autopilot.dynamics import (
-    HOLD_STILL,
-    DynamicsParameters,
-    GustParameters,
-    NoiseParameters,
-    OrnsteinUhlenbeck,
-    Setpoint,
-    Vehicle,
-    constrain_horizontal,
-    normals,
-)
+from sim.autopilot.disturbances import GustParameters, NoiseParameters, OrnsteinUhlenbeck, normals
+from sim.autopilot.dynamics import HOLD_STILL, DynamicsParameters, Setpoint, Vehicle, constrain_horizontal
 
 DT_S = 0.004
 GOLDEN = Path(__file__).parents[1] / "golden"

@@ -6,7 +6,7 @@ from pathlib import Path
 from companion.config import FleetConfig, load
 from companion.core.failsafe import Failsafe
 from companion.core.values import Instant
-from companion.io.recorder import Entry
+from companion.io.recording import Entry
 from companion.io.replay import OUTPUTS, replay
 from companion.vehicle.agent import Agent
 from companion.vehicle.autopilot.port import NOTHING, Heard

@@ -17,7 +17,8 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from companion.core.values import Instant
-from companion.io.recorder import Entry, Recorder, Recording, RecordingError, read_recording
+from companion.io.recorder import Recorder
+from companion.io.recording import Entry, Recording, RecordingError, read_recording
 
 METADATA = {"config": 'name = "größe"\n', "vehicle_id": "3", "boot_id": "77", "seed": ""}
 NOW = Instant(monotonic_ns=5_000_000_000, fleet_ns=1_700_000_000_000_000_000)

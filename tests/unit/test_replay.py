@@ -4,7 +4,7 @@ from pathlib import Path
 
 from companion.config import load
 from companion.core.values import Instant
-from companion.io.recorder import Entry
+from companion.io.recording import Entry
 from companion.io.replay import replay
 from companion.vehicle.agent import Agent
 

@@ -3,7 +3,8 @@
 import pytest
 from autopilot_flight import Flight, mavlink
 
-from sim.autopilot.dynamics import DynamicsParameters, GustParameters, NoiseParameters
+from sim.autopilot.disturbances import GustParameters, NoiseParameters
+from sim.autopilot.dynamics import DynamicsParameters
 from sim.autopilot.modes import LandedState, Mode
 
 

@@ -15,7 +15,7 @@ from companion.core.events import Event, MotionAdopted
 from companion.core.trajectory.fleet import FleetTrajectory
 from companion.core.trajectory.history import TrajectoryHistory
 from companion.errors import WireError
-from companion.io.recorder import Entry, RecordingError, read_recording
+from companion.io.recording import Entry, RecordingError, read_recording
 from companion.io.records import TickRecord, TrafficRecord, split_peer_body
 from companion.wire import operator as protocol
 from companion.wire.events import decode_event
