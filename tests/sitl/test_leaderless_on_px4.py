@@ -20,8 +20,8 @@ LEGS = [
 ]
 AFTER_S = 60.0
 """from the turn's end on the flight is looked at"""
-WITHIN_M_S = 0.2
-"""the autopilots' own estimates are off by as much; the mean of five is nearer"""
+WITHIN_M_S = 0.3
+"""the velocity estimates of PX4 1.16 are off by up to 0.25 m/s, slowly, and the fleet flies by them"""
 Property = Callable[[str, object], None]
 
 
@@ -61,7 +61,7 @@ def test_five_follow_the_two_that_are_informed_through_a_turn(
     summary: dict[str, Any] = json.loads(flight.up.out)
     off_m_s = np.linalg.norm(velocity - np.array([0.0, 1.0]), axis=1)
     responded_s = 0.1 * (int(np.flatnonzero(off_m_s > WITHIN_M_S)[-1]) + 1) - STRAIGHT_S
-    record_property("within 0.2 m/s of the informed, after the turn's begin (s)", responded_s)
+    record_property("within 0.3 m/s of the informed, after the turn's begin (s)", responded_s)
     record_property("mean velocity off by, last 10 s (m/s)", float(off_m_s[-100:].mean()))
     record_property("steady", {k: v for k, v in summary["steady"].items() if k != "windows"})
     record_property("believed", summary["believed"])
