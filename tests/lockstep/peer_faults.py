@@ -78,10 +78,12 @@ def restarted(shape: str, seed: int, line: bool, stops: bool = True) -> tuple[fl
 
 
 class Liar:
-    """Somebody inside who speaks under vehicle 2's id, and what that does to a V of five at 1 m/s."""
+    """Somebody inside who speaks under vehicle 2's id, and what that does to a V of five at 1 m/s, or to another
+    flight."""
 
-    def __init__(self, seed: int = 3) -> None:
-        self.ls = moving(5, "v", seed, [{"kind": "velocity", "north_m_s": 1.0, "duration_s": 200.0}])
+    def __init__(self, seed: int = 3, flight: Lockstep | None = None) -> None:
+        legs = [{"kind": "velocity", "north_m_s": 1.0, "duration_s": 200.0}]
+        self.ls = flight or moving(5, "v", seed, legs)
         self.since_s = self.ls.now_ns * 1e-9
         self.sequence = 0
 

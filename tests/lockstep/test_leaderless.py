@@ -19,11 +19,13 @@ from flights import (
     until_landed,
     wait,
 )
+from peer_faults import Liar
 
-from companion.core.values import Phase
+from companion.core.values import ZERO, CommonMotion, Phase
 from companion.io.replay import replay
 from companion.operator.client import Operator, turn_leg, velocity_leg
 from companion.vehicle.agent import Agent
+from companion.wire.peer import COMMON_MAX
 from sim.lockstep.lockstep import Lockstep
 from sim.lockstep.network import NetworkParameters
 
@@ -201,6 +203,28 @@ def test_a_fleet_that_is_drawn_against_the_fence_stays_inside_and_lands_on_comma
     assert np.hypot(t.position_ned_m[:, :, 0], t.position_ned_m[:, :, 1]).max() <= 25.0
     assert np.abs(mean_velocity(ls)).max() <= 0.15
     assert distances(truth(ls, 10.0)).min() >= 1.2
+    assert operator.land().all_accepted
+    until_landed(ls)
+
+
+@pytest.mark.parametrize("lie", ["away", "to and fro", "unlike"])
+def test_who_lies_about_the_common_velocity_draws_the_fleet_as_far_as_a_wish_does_and_no_further(lie: str) -> None:
+    ls = aloft(free_fleet(5, fence_m=30.0))
+    liar, operator = Liar(flight=ls), operator_of(ls)
+    liar.sequence = 1 << 20
+    for k in range(60):
+        east_m_s = {"away": COMMON_MAX, "to and fro": COMMON_MAX * (-1) ** k, "unlike": -COMMON_MAX + k}[lie]
+        rate_m_s2 = -east_m_s if lie == "unlike" else east_m_s
+        said = CommonMotion(0.0, east_m_s, 0.0, rate_m_s2)
+        liar.says(liar.beside(2, 0.0, 0.0, velocity_ned_m_s=ZERO, common=said), ls.vehicles[2].agent.boot_id)
+        wait(ls, 0.25)
+    t = truth(ls)
+    level = np.linalg.norm(t.velocity_ned_m_s[:, :, :2], axis=2)
+    assert np.hypot(t.position_ned_m[:, :, 0], t.position_ned_m[:, :, 1]).max() <= 30.0
+    assert distances(truth(ls, now_s(ls) - 15.0)).min() >= 1.2
+    assert level.max() > 0.5, "nobody believed a word"
+    assert level.max() <= ls.config.limits.speed_max_m_s
+    assert set(ls.phases().values()) <= {Phase.MOVING, Phase.DETACHED}
     assert operator.land().all_accepted
     until_landed(ls)
 
