@@ -2,7 +2,7 @@
 
 Each vehicle has an estimate nu_i of the common velocity, zero at hover, and
 
-    nu_i' = -2 mean_j sat(nu_i - nu_j)            over the nu_j as they follow from what was last published
+    nu_i' = -4 mean_j sat(nu_i - nu_j)            over the nu_j as they follow from what was last published
 
 saturated at 1 m/s. Nothing is measured, so sensor noise cannot random-walk it; between vehicles that all hear each
 other the mean of the nu_i stays what it was. nu_i stands for v_d in the law and in the hold (`core.prediction`). Who is
@@ -11,7 +11,7 @@ told where to go has its wish for nu_i, and draws the others: nobody passes the 
 
 from math import sqrt
 
-RATE_PER_S = 2.0
+RATE_PER_S = 4.0
 """how fast the estimates of the common velocity approach each other"""
 
 
