@@ -36,6 +36,7 @@ PLANNED = (
 WITHIN_M_S = 0.1
 Array = npt.NDArray[Any]
 Law = Annotated[str, typer.Option(help="law.kind")]
+Vehicles = Annotated[int, typer.Option(help="the first so many of the file")]
 app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__)
 
 
@@ -70,22 +71,23 @@ class Figures(NamedTuple):
     """how many predictions were farther off than their bound"""
 
 
-def flown_free(informed: list[int], seed: int, speaks: str, law: str) -> tuple[Lockstep, float]:
+def flown_free(informed: list[int], seed: int, speaks: str, law: str, vehicles: int) -> tuple[Lockstep, float]:
     """A fleet that has just begun to fly free, and when it did (s)."""
     plan = {"kind": "none", "informed": informed, "legs": list(LEGS) if informed else []}
-    ls = moving(plan, seed, speaks, law)
+    ls = moving(plan, seed, speaks, law, vehicles)
     free_ns = ls.vehicles[1].agent.history.newest.free_from_ns
     assert free_ns is not None, "the fleet has not come to fly free"
     return ls, (free_ns - UTC_AT_START_NS) * 1e-9
 
 
-def moving(plan: dict[str, Any], seed: int, speaks: str, law: str) -> Lockstep:
+def moving(plan: dict[str, Any], seed: int, speaks: str, law: str, vehicles: int) -> Lockstep:
     """A fleet that has formed and begins to move; what it was wrong by before is forgotten."""
 
     def change(tables: dict[str, Any]) -> None:
         del tables["fence"]
         tables["plan"] = plan
         tables["law"]["kind"] = law
+        tables["vehicle"] = tables["vehicle"][:vehicles]
 
     config: FleetConfig = load(ROOT / "fleet.toml", change)
     ls = Lockstep(config, seed=seed)
@@ -139,10 +141,11 @@ def turn(
     informed: Annotated[str, typer.Option(help="ids, with commas")] = "3,7",
     speaks: Annotated[str, typer.Option(help="trigger, heartbeats, or a period in seconds")] = "trigger",
     law: Law = "starling",
+    vehicles: Vehicles = 10,
 ) -> None:
     """Those informed turn; the others follow by what they are told."""
     ids = [int(i) for i in informed.split(",")]
-    ls, free_s = flown_free(ids, seed, speaks, law)
+    ls, free_s = flown_free(ids, seed, speaks, law, vehicles)
     turn_s = free_s + STRAIGHT_S
     ls.run_until(turn_s + AFTER_S)
     f = figures(ls, turn_s, turn_s + AFTER_S)
@@ -152,7 +155,7 @@ def turn(
     off = np.flatnonzero(np.linalg.norm(f.mean_velocity - wanted, axis=1) > WITHIN_M_S)
     after = f"{f.seconds[off[-1]] - turn_s:.1f} s" if len(off) and off[-1] < len(f.seconds) - 50 else "not"
     typer.echo(
-        f"{law}, seed {seed}, informed {informed}, {speaks}: "
+        f"{law}, {vehicles} vehicles, seed {seed}, informed {informed}, {speaks}: "
         f"mean velocity within {WITHIN_M_S} m/s after {after}, {told(f)}"
     )
 
@@ -162,13 +165,14 @@ def hover(
     seed: Annotated[int, typer.Option(help="of noise and gusts")] = 200,
     seconds: Annotated[float, typer.Option(help="of flight")] = 300.0,
     law: Law = "starling",
+    vehicles: Vehicles = 10,
 ) -> None:
     """Nobody is informed: how far the mean velocity drifts."""
-    ls, free_s = flown_free([], seed, "trigger", law)
+    ls, free_s = flown_free([], seed, "trigger", law, vehicles)
     ls.run_until(free_s + seconds)
     f = figures(ls, free_s + 3.0, free_s + seconds)
     drift = float(np.linalg.norm(f.mean_velocity.mean(axis=0)))
-    typer.echo(f"{law}, seed {seed}, {seconds:g} s: mean velocity {drift:.4f} m/s, {told(f)}")
+    typer.echo(f"{law}, {vehicles} vehicles, seed {seed}, {seconds:g} s: mean velocity {drift:.4f} m/s, {told(f)}")
 
 
 @app.command()
@@ -176,14 +180,17 @@ def planned(
     seed: Annotated[int, typer.Option(help="of noise and gusts")] = 200,
     speaks: Annotated[str, typer.Option(help="trigger, heartbeats, or a period in seconds")] = "trigger",
     law: Law = "starling",
+    vehicles: Vehicles = 10,
 ) -> None:
     """All share a plan: straight on, and a turn of 90 degrees in 15 s."""
-    ls = moving({"legs": list(PLANNED)}, seed, speaks, law)
+    ls = moving({"legs": list(PLANNED)}, seed, speaks, law, vehicles)
     begin_s = (ls.vehicles[1].agent.history.newest.legs_start_ns - UTC_AT_START_NS) * 1e-9
     turn_s, end_s = begin_s + PLANNED_S, begin_s + PLANNED_S + 20.0
     ls.run_until(end_s)
     for name, from_s, to_s in (("straight", begin_s + 1.0, turn_s), ("turn and 5 s on", turn_s, end_s)):
-        typer.echo(f"{law}, seed {seed}, {speaks}, planned, {name}: {told(figures(ls, from_s, to_s))}")
+        typer.echo(
+            f"{law}, {vehicles} vehicles, seed {seed}, {speaks}, planned, {name}: {told(figures(ls, from_s, to_s))}"
+        )
 
 
 if __name__ == "__main__":
