@@ -173,19 +173,19 @@ class FleetConfig(FleetTables):
     def peer_motion(self) -> PeerMotion:
         """What the vehicles must reckon with in each other.
 
-        The hold brakes the velocity of a vehicle that may fly at the speed limit relative to its plan; the filter may
-        push it on meanwhile. The paper's hold lets it stand.
+        The law's hold brakes a vehicle that may fly at the speed limit relative to its plan; the filter may push it on
+        meanwhile.
         """
         x = self.limits
-        braking = x.speed_max_m_s / self.law.hold_damping_s if self.law.hold == "damped" else 0.0
+        hold = self.law.holding().bounds(x.speed_max_m_s)
         return PeerMotion(
             sigma_p_m=x.position_noise_m,
             sigma_v_m_s=x.velocity_noise_m_s,
             sigma_gust_m_s2=x.gust_m_s2,
             a_max_m_s2=self.law.a_max_m_s2,
-            deviation_m_s2=max(x.avoidance_acceleration_m_s2, self.law.a_max_m_s2) + braking,
-            drift_m_s=x.speed_max_m_s if self.law.hold == "zero" else 0.0,
-            speed_m_s=2.0 * x.speed_max_m_s,
+            deviation_m_s2=max(x.avoidance_acceleration_m_s2, self.law.a_max_m_s2) + hold.braking_m_s2,
+            drift_m_s=hold.drift_m_s,
+            speed_m_s=2.0 * x.speed_max_m_s + hold.gained_m_s,
             lag_s=COMMAND_LAG_S,
             latency_s=EXCHANGE_DELAY_S + 1.0 / x.control_rate_hz,
             t_min_s=self.trigger.t_min_s,
@@ -264,8 +264,7 @@ class FleetConfig(FleetTables):
     @property
     def peer_limits(self) -> PeerLimits:
         return PeerLimits(
-            hold=self.law.hold,
-            hold_damping_s=self.law.hold_damping_s,
+            hold=self.law.holding(),
             range_m=self.peers.range_m,
             stale_after_s=STALE_AFTER * self.trigger.t_max_s,
             heartbeat_s=self.trigger.t_max_s,

@@ -7,9 +7,10 @@ from pydantic import Field, PlainValidator, SerializeAsAny
 from companion.config.numbers import Gain
 from companion.config.registry import KindTable, Registry
 from companion.core.law.base import Law
+from companion.core.law.intent import IntentGains, IntentHold, IntentLaw
 from companion.core.law.paper import paper_gains
 from companion.core.law.starling import Gains, StarlingLaw
-from companion.core.prediction import HoldKind
+from companion.core.prediction import Hold, HoldKind, PlainHold
 
 
 class LawTable(KindTable):
@@ -27,6 +28,10 @@ class LawTable(KindTable):
     def law(self, r0_m: float) -> Law:
         """The law of one vehicle, with the range of separation resolved."""
         raise NotImplementedError
+
+    def holding(self) -> Hold:
+        """How a vehicle that flies this law is predicted, by itself and by all others; a law may have its own."""
+        return PlainHold(self.hold, self.hold_damping_s)
 
 
 class StarlingTable(LawTable):
@@ -60,6 +65,33 @@ class PaperTable(LawTable):
         return StarlingLaw(gains._replace(a_max=self.a_max_m_s2, vertical=0.0))
 
 
-LAWS = Registry("starling.laws", LawTable, StarlingTable, PaperTable)
+class IntentTable(LawTable):
+    """Published intent. Of the keys of the hold only the damping counts: the hold is its own."""
+
+    kind: Literal["intent"] = "intent"
+    k_s: Gain = 3.0
+    k_e: Annotated[float, Field(ge=0.1, le=20, allow_inf_nan=False)] = 4.0
+    """tracking of the own intended place (1/s^2): a softer one would not come back from a gust"""
+    k_d: Gain = 4.0
+    c_g: Annotated[float, Field(ge=0.1, le=10, allow_inf_nan=False)] = 2.0
+    """how fast anchors approach each other (1/s): faster, delays of the exchange would ring"""
+    c_max_m_s: Annotated[float, Field(ge=0.01, le=5, allow_inf_nan=False)] = 1.0
+    """most speed of an anchor against the plan, which the safety radius counts in"""
+
+    @property
+    def _gains(self) -> IntentGains:
+        return IntentGains(self.k_e, self.k_d, self.c_g, self.c_max_m_s, 1.0, 1.0)
+
+    def law(self, r0_m: float) -> Law:
+        """See `LawTable`."""
+        apart = Gains(self.k_s, 0.0, 0.0, 0.0, 0.0, r0_m, self.a_max_m_s2, 1.0, 1.0, 1.0, vertical=0.0)
+        return IntentLaw(self._gains, apart)
+
+    def holding(self) -> Hold:
+        """See `LawTable`."""
+        return IntentHold(self._gains, self.a_max_m_s2, self.hold_damping_s)
+
+
+LAWS = Registry("starling.laws", LawTable, StarlingTable, PaperTable, IntentTable)
 """the kinds of `law.kind`; the first is the default"""
 AnyLaw = Annotated[SerializeAsAny[LawTable], PlainValidator(LAWS.validate)]

@@ -50,10 +50,15 @@ class ErrorTable(TriggerTable):
     kappa: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)] = 0.3
     epsilon_nu_m_s: Annotated[float, Field(ge=0.01, le=5, allow_inf_nan=False)] = 0.03
     """of the common velocity, where no plan gives one"""
+    epsilon_c_m: Annotated[float, Field(ge=0.001, le=5, allow_inf_nan=False)] = 0.005
+    """of the intended place, with `law.kind = "intent"`: it is known without noise"""
+    kappa_c: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)] = 0.8
 
     def trigger(self) -> Trigger:
         """See `TriggerTable`."""
-        return ErrorTrigger(self.epsilon_m, self.gamma_s2, self.kappa, self.epsilon_nu_m_s)
+        return ErrorTrigger(
+            self.epsilon_m, self.gamma_s2, self.kappa, self.epsilon_nu_m_s, self.epsilon_c_m, self.kappa_c
+        )
 
 
 class SwitchingTable(TriggerTable):

@@ -1,5 +1,7 @@
 """Hold: what a sample says about now. The sender and every receiver call this one function, so they agree.
 
+A law may have a hold of its own (`core.law.intent`), which its table makes (`config.law_tables`). The others have
+
 damped   p^ = p_k + [p_ref(t) - p_ref(t_k)] + T_d (1 - e^(-tau/T_d)) (v_k - v_d(t_k))
          v^ = v_d(t) + e^(-tau/T_d) (v_k - v_d(t_k))                            tau = t - t_k
 zero     p^ = p_k, v^ = v_k                                                     (the paper's)
@@ -10,14 +12,59 @@ Where no motion is shared, the sender's own estimate nu_k of the common velocity
          v_d(t_k + tau) = nu_k + a_k T_a (1 - e^(-tau/T_a)),   p_ref(t) - p_ref(t_k) its integral
 """
 
+from dataclasses import dataclass
 from math import exp
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Protocol
 
-from companion.core.values import CommonMotion
+from companion.core.frames import Ned, new
+from companion.core.trajectory.fleet import Reference
+from companion.core.values import CommonMotion, PeerSample
 
 RATE_FADES_S = 2.0
 """T_a: how long a common velocity goes on changing as it did"""
 HoldKind = Literal["damped", "zero", "first"]
+
+
+class Held(NamedTuple):
+    """A sample carried on to another time."""
+
+    position_ned_m: Ned
+    velocity_ned_m_s: Ned
+    told: tuple[float, ...]
+    """the law's own numbers (`Law.fields`) as they are by then"""
+
+
+class HoldBounds(NamedTuple):
+    """What others must reckon with in a hold, for samples of vehicles that keep a speed limit."""
+
+    braking_m_s2: float
+    """most acceleration beside the plan's that it predicts"""
+    drift_m_s: float
+    """most speed of a sample that it leaves out of the prediction"""
+    gained_m_s: float
+    """most speed that it adds to those of sample and plan"""
+
+
+class Hold(Protocol):
+    """What a vehicle in formation is taken to do after a sample: a pure function, in all vehicles the same."""
+
+    def at(self, sample: PeerSample, then: tuple[Ned, Ned], now: Reference, tau_s: float) -> Held:
+        """A sample `tau_s` old (>= 0), carried on to now.
+
+        `then` is p_ref and v_d of the sender's slot at the sample's time, `now` its reference now. Where no motion is
+        shared both have the sender's own account of the common motion in them, and of the places only their difference
+        has a meaning.
+        """
+        ...
+
+    def told_error_m(self, foreseen: tuple[float, ...], tells: tuple[float, ...]) -> float:
+        """How far off the peers are by the law's own numbers alone, as they foresee them and as they are (m); 0 where
+        that is of no moment. Triggers look at it (`Situation.error_told_m`)."""
+        ...
+
+    def bounds(self, speed_max_m_s: float) -> HoldBounds:
+        """What the error bound of a silent peer has to count in."""
+        ...
 
 
 class Weights(NamedTuple):
@@ -64,6 +111,35 @@ def axis(
         p + w.plan * (ref_now - ref_then) + w.position * relative,
         w.plan * vref_now + w.velocity * relative,
     )
+
+
+@dataclass(frozen=True, slots=True)
+class PlainHold:
+    """`Hold` by the kinds above, of position and velocity; the law's numbers stay what they were."""
+
+    kind: HoldKind
+    damping_s: float
+
+    def at(self, sample: PeerSample, then: tuple[Ned, Ned], now: Reference, tau_s: float) -> Held:
+        """See `Hold`."""
+        w = weights(self.kind, tau_s, self.damping_s)
+        p, v = sample.position_ned_m, sample.velocity_ned_m_s
+        then_p, then_v = then
+        now_p, now_v = now.position_ned_m, now.velocity_ned_m_s
+        x, vx = axis(p.north, v.north, then_p.north, then_v.north, now_p.north, now_v.north, w)
+        y, vy = axis(p.east, v.east, then_p.east, then_v.east, now_p.east, now_v.east, w)
+        z, vz = axis(p.down, v.down, then_p.down, then_v.down, now_p.down, now_v.down, w)
+        return new(Held, (new(Ned, (x, y, z)), new(Ned, (vx, vy, vz)), sample.told))
+
+    def told_error_m(self, foreseen: tuple[float, ...], tells: tuple[float, ...]) -> float:
+        """0."""
+        del foreseen, tells
+        return 0.0
+
+    def bounds(self, speed_max_m_s: float) -> HoldBounds:
+        """The damped hold brakes what relative velocity there is, the paper's lets it stand."""
+        braking = speed_max_m_s / self.damping_s if self.kind == "damped" else 0.0
+        return HoldBounds(braking, speed_max_m_s if self.kind == "zero" else 0.0, 0.0)
 
 
 class CommonWay(NamedTuple):

@@ -92,6 +92,8 @@ class PeerSample(NamedTuple):
     phase: Phase
     common: CommonMotion | None = None
     """in formation, where no motion is shared; else None"""
+    told: tuple[float, ...] = ()
+    """what the vehicle's law adds (`core.law.base.Law.fields`)"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,8 +114,6 @@ class PeerMessage:
     """vehicles that the sender finds near (`core.trigger.near`), ascending"""
     due_soon: bool = False
     """the sender speaks in near mode: its next message comes within `trigger.near_period_s` and a control period"""
-    told: tuple[float, ...] = ()
-    """what the sender's law adds (`core.law.base.Law.fields`)"""
 
 
 class Neighbour(NamedTuple):
@@ -138,7 +138,7 @@ class Neighbour(NamedTuple):
     """what the plan asks of its slot: differs from the own slot's while slots turn or move"""
     reference_acceleration_ned_m_s2: Ned = ZERO
     told: tuple[float, ...] = ()
-    """what its law told last, by the peer's own message (`core.law.base.Law.fields`); empty before the first"""
+    """what its law tells (`core.law.base.Law.fields`), as the law's hold carries it on from the sample"""
 
 
 class Command(NamedTuple):

@@ -8,6 +8,7 @@ the part that does it: `observer`, `supervisor`, `peers`, `plans`, `publisher`, 
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from math import dist
 from random import Random
 
@@ -39,7 +40,7 @@ from companion.vehicle.agreement import Agreement
 from companion.vehicle.autopilot.adapters import open_autopilot
 from companion.vehicle.autopilot.port import AutopilotPort, Heard
 from companion.vehicle.graph_watch import GraphWatch
-from companion.vehicle.guest import GUESTS, law_of, trigger_of
+from companion.vehicle.guest import GUESTS, hold_of, law_of, trigger_of
 from companion.vehicle.observer import StateObserver
 from companion.vehicle.operator_port import Activity, OperatorPort
 from companion.vehicle.orders import OrderBook
@@ -80,7 +81,8 @@ class Agent:
         random = Random(vehicle_id << 32 | boot_id)
         self.autopilot: AutopilotPort = open_autopilot(config, self.vehicle)
         self.history = TrajectoryHistory([config.first_motion])
-        self.peers = PeerTable(vehicle_id, others, config.peer_limits, self.history)
+        limits = replace(config.peer_limits, hold=hold_of(config, self.rejected))
+        self.peers = PeerTable(vehicle_id, others, limits, self.history)
         self.law = law_of(config, self.rejected)
         """what is flown, before the filter; tests and studies may put another in its place"""
         self.safety = SafetyFilter(config.safety_limits)
@@ -161,7 +163,7 @@ class Agent:
         message = decode_state(payload)
         if sender != str(message.sample.vehicle_id):
             self.rejected["state: id is not the key's"] += 1
-        elif len(message.told) != len(self.law.fields):
+        elif any(len(s.told) != len(self.law.fields) for s in (message.sample, *message.digest)):
             self.rejected["state: of another law"] += 1
         elif self.peers.accept(message, now) is None:
             if self.id in message.near_ids:
@@ -244,7 +246,7 @@ class Agent:
         formation = self.agreement.advance(plan, shared, self._neighbours, part, now)
         neighbours = self._predict(ego, formation, now)
         formation = self.agreement.place(plan, formation, ego, neighbours, part, now)
-        own = slot if formation is shared else formation.slot(plan.slots[self.id])
+        own = slot if formation is shared else formation.slot(plan.slots[self.id])._replace(shared=False)
         reference = self.supervisor.follow(own, ego, now)
         residual, setpoint = ZERO, None
         if self.supervisor.steers:

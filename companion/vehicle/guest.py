@@ -2,13 +2,14 @@
 
 A guest's law says a level acceleration, held to `law.a_max_m_s2`, on which the error bound builds; altitude, heading
 and setpoint are not its own, and the safety filter comes after it. What it is given cannot be changed. One that raises,
-or says what is no finite number, lets the vehicle brake in that tick; a trigger that raises speaks. All of it is
-counted. Time is not guarded (`fleet law check` says what a call costs), nor is what Python lets any code do on purpose.
+or says what is no finite number, lets the vehicle brake in that tick; for a hold that does so the damped one stands; a
+trigger that raises speaks. All of it is counted. Time is not guarded (`fleet law check` says what a call costs), nor is
+what Python lets any code do on purpose.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import hypot, isfinite, nan
+from math import hypot, inf, isfinite, nan
 
 from companion.config import FleetConfig
 from companion.config.law_tables import LAWS
@@ -17,14 +18,16 @@ from companion.core.counts import Counts
 from companion.core.frames import Ned
 from companion.core.law.base import Law, Wanted
 from companion.core.monitor import PeerMotion
+from companion.core.prediction import Held, Hold, HoldBounds, PlainHold
 from companion.core.trajectory.fleet import Reference
 from companion.core.trigger.base import Situation, Trigger
-from companion.core.values import ZERO, Neighbour, VehicleState
+from companion.core.values import ZERO, Neighbour, PeerSample, VehicleState
 from companion.wire.peer import PLAUSIBLE_MAX
 
 LAW_RAISED, LAW_NOT_FINITE, LAW_LIMITED = "law: raised", "law: not finite", "law: held to its limit"
+HOLD_FAILED = "hold: raised or not finite"
 TRIGGER_RAISED = "trigger: raised"
-GUESTS = (LAW_RAISED, LAW_NOT_FINITE, LAW_LIMITED, TRIGGER_RAISED)
+GUESTS = (LAW_RAISED, LAW_NOT_FINITE, LAW_LIMITED, HOLD_FAILED, TRIGGER_RAISED)
 """what guests are counted for"""
 FAILURES = (Exception, SystemExit)
 """what a guest may raise without ending anything"""
@@ -36,6 +39,14 @@ def law_of(config: FleetConfig, counts: Counts) -> Law:
     """The law of one vehicle; a foreign one as a guest."""
     law = config.law.law(config.r0_m)
     return law if LAWS.origin(config.law.kind) is None else GuestLaw(law, config.law.a_max_m_s2, counts)
+
+
+def hold_of(config: FleetConfig, counts: Counts) -> Hold:
+    """How peers are predicted; a foreign hold as a guest."""
+    hold = config.law.holding()
+    if LAWS.origin(config.law.kind) is None or isinstance(hold, PlainHold):
+        return hold
+    return GuestHold(hold, PlainHold("damped", config.law.hold_damping_s), counts)
 
 
 def trigger_of(config: FleetConfig, counts: Counts) -> Trigger:
@@ -101,6 +112,39 @@ class GuestLaw:
             return self._told
         self._told = told
         return told
+
+
+@dataclass(slots=True)
+class GuestHold:
+    """A foreign hold."""
+
+    hold: Hold
+    instead: Hold
+    counts: Counts
+
+    def at(self, sample: PeerSample, then: tuple[Ned, Ned], now: Reference, tau_s: float) -> Held:
+        """What it foretells, where that is a state; else what the damped hold does."""
+        try:
+            position, velocity, told = self.hold.at(sample, then, now, tau_s)
+            held = Held(Ned(*map(float, position)), Ned(*map(float, velocity)), tuple(map(float, told)))
+            if all(map(isfinite, (*held.position_ned_m, *held.velocity_ned_m_s, *held.told))):
+                return held
+        except FAILURES:
+            pass
+        self.counts[HOLD_FAILED] += 1
+        return self.instead.at(sample, then, now, tau_s)
+
+    def told_error_m(self, foreseen: tuple[float, ...], tells: tuple[float, ...]) -> float:
+        """What it says; a vehicle of which it fails to say it speaks."""
+        try:
+            return float(self.hold.told_error_m(foreseen, tells))
+        except FAILURES:
+            self.counts[HOLD_FAILED] += 1
+            return inf
+
+    def bounds(self, speed_max_m_s: float) -> HoldBounds:
+        """See `Hold`."""
+        return self.hold.bounds(speed_max_m_s)
 
 
 @dataclass(slots=True)

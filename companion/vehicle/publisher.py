@@ -104,8 +104,6 @@ class Publisher:
         self._sent: tuple[PeerSample, tuple[Ned, Ned]] | None = None
         """last sample sent, with p_ref and v_d of the own slot at its time"""
         self._sent_ns = 0
-        self._told: tuple[float, ...] = ()
-        """what the law added to it"""
         self._silence_limit_s = 0.0
         self._announce_ns: list[int] = []
         """when what is announced is to be said, ascending"""
@@ -191,10 +189,11 @@ class Publisher:
             return None
         newest = self._history.newest
         sample = PeerSample(
-            self._id, now.fleet_ns, own.position_ned_m, own.velocity_ned_m_s, newest.revision, own.phase, own.common
-        )
+            self._id, now.fleet_ns, own.position_ned_m, own.velocity_ned_m_s, newest.revision, own.phase, own.common,
+            own.told,
+        )  # fmt: skip
         self._sent = (sample, self._reference_then(sample))
-        self._sent_ns, self._told = now.monotonic_ns, own.told
+        self._sent_ns = now.monotonic_ns
         self._silence_limit_s = self._t_max_s * (1.0 - HEARTBEAT_JITTER + HEARTBEAT_JITTER * self._random.random())
         self._sequence = (self._sequence + 1) % (1 << 32)
         self.near.promised = near
@@ -204,7 +203,7 @@ class Publisher:
         return encode_state(
             PeerMessage(
                 self._boot_id, self._sequence, newest.start_ns, newest.issuer, sample, self._peers.digest(),
-                near_ids=near_ids, due_soon=near, told=own.told,
+                near_ids=near_ids, due_soon=near,
             )
         )  # fmt: skip
 
@@ -229,7 +228,8 @@ class Publisher:
 
     def _situation(self, sent: tuple[PeerSample, tuple[Ned, Ned]], own: OwnState, now: Instant) -> Situation:
         """What the trigger decides upon: the own state against what the peers predict of it."""
-        p, v = self._peers.foresight.under(own.reference, *sent, now.fleet_ns)
+        foresight, formed = self._peers.foresight, {own.phase, sent[0].phase} <= FORMATION_PHASES
+        p, v, told = foresight.under(own.reference, *sent, now.fleet_ns)
         position, velocity, residual = own.position_ned_m, own.velocity_ned_m_s, own.mean_residual_m
         since_ns = own.formation_since_ns
         return Situation(
@@ -239,9 +239,10 @@ class Publisher:
             0.0 if since_ns is None else (now.fleet_ns - since_ns) * 1e-9,
             now.monotonic_ns + self._clock_shift_ns,
             self._sent_ns + self._clock_shift_ns,
-            self._told,
+            told,
             own.told,
             _common_error_2(sent[0], own.common, now),
+            foresight.limits.hold.told_error_m(told, own.told) if formed else 0.0,
         )
 
     def _reference_then(self, sample: PeerSample) -> tuple[Ned, Ned]:

@@ -5,7 +5,7 @@
     sample  q time ns, 3f position (m), 3f velocity (m/s)                                  fleet frame, NED
     digest  for each entry: B vehicle id, B phase, I revision, sample
     near    for each id: B vehicle id, ascending
-    law     with flag 2: B count (1 to FIELDS_MAX), f each
+    law     with flag 2: B count (1 to FIELDS_MAX), so many f of the own sample, then as many of each of the digest's
     common  with flag 4: B count, then for each: B which sample (0: the own, k: the digest's k-th), 2f velocity (m/s),
             2f its rate (m/s^2), north and east; ascending
 
@@ -68,7 +68,7 @@ def encode_state(message: PeerMessage) -> bytes:
     """A state message's payload."""
     s = message.sample
     common = [(k, x.common) for k, x in enumerate((s, *message.digest)) if x.common is not None]
-    flags = DUE_SOON * message.due_soon | TOLD * bool(message.told) | COMMON * bool(common)
+    flags = DUE_SOON * message.due_soon | TOLD * bool(s.told) | COMMON * bool(common)
     parts = [
         _HEADER.pack(
             VERSION, s.vehicle_id, s.phase, len(message.digest), message.boot_id, message.sequence, s.revision,
@@ -79,8 +79,9 @@ def encode_state(message: PeerMessage) -> bytes:
     for entry in message.digest:
         parts += [_ENTRY.pack(entry.vehicle_id, entry.phase, entry.revision), _sample_bytes(entry)]
     parts.append(bytes(message.near_ids))
-    if message.told:
-        parts.append(struct.pack(f"<B{len(message.told)}f", len(message.told), *message.told))
+    if s.told:
+        numbers = [x for sample in (s, *message.digest) for x in sample.told]
+        parts.append(struct.pack(f"<B{len(numbers)}f", len(s.told), *numbers))
     if common:
         parts += [bytes([len(common)]), *(_COMMON.pack(k, *said) for k, said in common)]
     return b"".join(parts)
@@ -104,33 +105,31 @@ def decode_state(payload: bytes) -> PeerMessage:
         raise WireError("flags")
     each = _ENTRY.size + _SAMPLE.size
     end = _HEADER.size + _SAMPLE.size + entries * each + near
-    told = _told(payload, end) if flags & TOLD else ()
-    rest = end + (1 + 4 * len(told) if flags & TOLD else 0)
+    told = _told(payload, end, 1 + entries) if flags & TOLD else [()] * (1 + entries)
+    rest = end + (1 + 4 * sum(map(len, told)) if flags & TOLD else 0)
     common = _commons(payload, rest, entries) if flags & COMMON else {}
     if len(payload) != rest + (1 + _COMMON.size * len(common) if flags & COMMON else 0):
         raise WireError("length")
     near_ids = tuple(payload[end - near : end])
     if any(a >= b for a, b in pairwise(near_ids)):
         raise WireError("near ids")
-    sample = _sample(payload, _HEADER.size, vehicle_id, phase, revision)._replace(common=common.get(0))
+    sample = _sample(payload, _HEADER.size, vehicle_id, phase, revision)._replace(common=common.get(0), told=told[0])
     digest = []
     for k in range(entries):
         at = _HEADER.size + _SAMPLE.size + k * each
         entry = _sample(payload, at + _ENTRY.size, *_ENTRY.unpack_from(payload, at))
-        digest.append(entry._replace(common=common.get(k + 1)))
-    return PeerMessage(
-        boot_id, sequence, start_ns, issuer, sample, tuple(digest), near_ids, bool(flags & DUE_SOON), told
-    )
+        digest.append(entry._replace(common=common.get(k + 1), told=told[k + 1]))
+    return PeerMessage(boot_id, sequence, start_ns, issuer, sample, tuple(digest), near_ids, bool(flags & DUE_SOON))
 
 
-def _told(payload: bytes, at: int) -> tuple[float, ...]:
-    """The numbers of the sender's law, of which there are some."""
+def _told(payload: bytes, at: int, samples: int) -> list[tuple[float, ...]]:
+    """The numbers of the law, of which there are some, for each of the samples."""
     count = payload[at] if len(payload) > at else 0
-    if not 0 < count <= FIELDS_MAX or len(payload) < at + 1 + 4 * count:
+    if not 0 < count <= FIELDS_MAX or len(payload) < at + 1 + 4 * count * samples:
         raise WireError("length")
-    numbers: tuple[float, ...] = struct.unpack_from(f"<{count}f", payload, at + 1)
+    numbers = struct.unpack_from(f"<{count * samples}f", payload, at + 1)
     _examine(numbers)
-    return numbers
+    return [numbers[k * count : (k + 1) * count] for k in range(samples)]
 
 
 def _commons(payload: bytes, at: int, entries: int) -> dict[int, CommonMotion]:

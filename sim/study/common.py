@@ -43,7 +43,7 @@ MESSAGE_BYTES = 59
 DIGEST_ENTRY_BYTES = 38
 INTENT_EXTRA_BYTES = 36
 TOLD_BYTES = 4
-"""of each number that a law adds to its messages, and a byte for their count"""
+"""of each number that a law adds to each sample, and a byte of a message for their count"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -306,8 +306,8 @@ def payload_bytes(run: Run) -> int:
     extra = INTENT_EXTRA_BYTES if run.setup.law == "intent" else 0
     table = run.setup.law_table()
     fields = 0 if table is None else len(table.law(run.setup.r0_m).fields)
-    told = 1 + TOLD_BYTES * fields if fields else 0
-    return run.messages * (MESSAGE_BYTES + extra + told) + entries * (DIGEST_ENTRY_BYTES + extra)
+    told = TOLD_BYTES * fields
+    return run.messages * (MESSAGE_BYTES + extra + told + bool(fields)) + entries * (DIGEST_ENTRY_BYTES + extra + told)
 
 
 def fewer_percent(messages: float, setup: Setup) -> float:

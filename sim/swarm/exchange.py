@@ -284,10 +284,10 @@ def _digest(i: int, at: int, k: int, s: State, o: Options) -> None:
 
 
 @kernel
-def _store(e: int, sample: Floats, step: int, size: int, s: State) -> None:
+def _store(e: int, sample: Floats, step: int, s: State) -> None:
     if step > s.held_step[e]:
         s.held_step[e] = step
-        for c in range(size):
+        for c in range(SAMPLE):
             s.held[e, c] = sample[c]
 
 
@@ -336,7 +336,7 @@ def deliver(k: int, tick: int, s: State, o: Options) -> None:
                 s.held_due[e] = s.ring_due[at, j]
                 if s.ring_near[at, j, i] == 1:
                     s.named_until[i] = k + o.near_hold
-            _store(e, s.ring[at, j], s.ring_step[at, j], SAMPLE, s)
+            _store(e, s.ring[at, j], s.ring_step[at, j], s)
             for d_at in range(o.digest):
                 about = s.ring_digest_id[at, j, d_at]
                 if about < 0:
@@ -344,7 +344,7 @@ def deliver(k: int, tick: int, s: State, o: Options) -> None:
                 if about != i:
                     # row i lists every other agent in ascending order
                     _store(s.start[i] + about - (1 if about > i else 0), s.ring_digest[at, j, d_at],
-                           s.ring_digest_step[at, j, d_at], TOLD, s)  # fmt: skip
+                           s.ring_digest_step[at, j, d_at], s)  # fmt: skip
 
 
 @kernel

@@ -293,7 +293,7 @@ def command(k: int, s: State, ref: Floats, o: Options, g: Gains, ig: IntentGains
         if k < s.joined[i]:
             # it flies along with the plan where it is
             place = ego.position_ned_m
-        reference = Reference(place, common, asked, 0.0)
+        reference = Reference(place, common, asked, 0.0, True)
         count = look(i, k, own, common, s, ref, o)
         sums = sums_over(ego, common, s.near, count, False, g)
         if o.separation_on_truth == 1 or o.separation_kind != CUT:

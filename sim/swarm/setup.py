@@ -281,7 +281,8 @@ class Setup:
             return None
         where = f"law = {self.law!r}"
         if LAWS.table(self.law) is None:
-            raise ConfigError(f"law must be one of {', '.join((*COMPILED_LAWS, *LAWS.known()))}, got {self.law!r}")
+            known = dict.fromkeys((*COMPILED_LAWS, *LAWS.known()))
+            raise ConfigError(f"law must be one of {', '.join(known)}, got {self.law!r}")
         if self.reading != "V2" or self.separation != "cut" or not self.plan:
             raise ConfigError(f"{where} flies a plan (plan = true) and knows one reading: reading V2, separation cut")
         shared = {

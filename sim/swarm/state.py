@@ -14,9 +14,9 @@ Flags = npt.NDArray[np.uint8]
 HOLD_ZERO, HOLD_FIRST, HOLD_DAMPED, HOLD_OBSERVER = 0, 1, 2, 3
 ERROR, SWITCHING, PERIODIC, FLOAT_CLOCK, CLASSIC, ELASTIC, INTENT = 0, 1, 2, 3, 4, 5, 6
 TOLD = 15
-"""floats of a sample that others pass on: flown law p, v, nu; published intent c, g, w, e, e'"""
+"""floats of a sample's motion: flown law p, v, nu; published intent c, g, w, e, e'"""
 SAMPLE = TOLD + FIELDS_MAX
-"""floats of a sample: those, and what a law adds to its own messages"""
+"""floats of a sample: those, and what a law adds"""
 DIGEST_MAX = 16
 """most samples of peers that a message carries"""
 ROW = 22

@@ -93,7 +93,7 @@ def test_a_foreign_law_and_trigger_take_a_lossy_fleet_into_formation_along_the_p
 
 
 @pytest.mark.usefixtures("springs")
-@pytest.mark.parametrize("name", ["springs", "starling", "paper"])
+@pytest.mark.parametrize("name", ["springs", "starling", "paper", "intent"])
 def test_every_law_passes_its_check(name: str) -> None:
     rows = list(check(name))
     assert [r for r in rows if not r.passed] == []

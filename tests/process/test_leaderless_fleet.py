@@ -12,8 +12,9 @@ from companion.wire.operator import Status
 pytestmark = [pytest.mark.process, pytest.mark.timeout(400)]
 
 
-def test_four_follow_the_one_that_is_told_and_hold_where_they_are_by_then(tmp_path: Path) -> None:
-    fleet = make_fleet(tmp_path, 4, plan={"kind": "none"})
+@pytest.mark.parametrize("law", ["starling", "intent"])
+def test_four_follow_the_one_that_is_told_and_hold_where_they_are_by_then(tmp_path: Path, law: str) -> None:
+    fleet = make_fleet(tmp_path, 4, plan={"kind": "none"}, law={"kind": law})
     out = fleet.folder / "flights"
 
     def drawn(said: dict[int, Status]) -> bool:

@@ -296,7 +296,7 @@ def test_a_vehicle_that_goes_on_with_the_common_motion_is_where_the_hold_says(v:
     foresight = Foresight(TrajectoryHistory([config.first_motion, motion]), config.peer_limits)
     p = Ned(40.0, -3.0, -10.0)
     sample = PeerSample(2, ns(0.0), p, v, 2, Phase.MOVING, CommonMotion(v.north, v.east, 0.0, 0.0))
-    place, velocity = foresight.at(sample, foresight.reference_then(sample), ns(age_s))
+    place, velocity, _ = foresight.at(sample, foresight.reference_then(sample), ns(age_s))
     assert place == pytest.approx(Ned(p.north + v.north * age_s, p.east + v.east * age_s, p.down))
     assert velocity == pytest.approx(v)
 
@@ -315,7 +315,7 @@ def test_a_shared_motion_that_takes_over_carries_a_sample_on_from_where_it_was_b
     foresight = Foresight(TrajectoryHistory([config.first_motion, motion, shared]), config.peer_limits)
     p = Ned(295.0, 4.0, -10.0)
     sample = PeerSample(2, ns(0.0), p, v, 2, Phase.MOVING, CommonMotion(v.north, v.east, 0.0, 0.0))
-    place, _ = foresight.at(sample, foresight.reference_then(sample), ns(until_s + since_s))
+    place, _, _ = foresight.at(sample, foresight.reference_then(sample), ns(until_s + since_s))
     gone_s = until_s + since_s
     assert place == pytest.approx(Ned(p.north + v.north * gone_s, p.east + v.east * gone_s, p.down), abs=1e-6)
 

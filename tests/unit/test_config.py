@@ -138,7 +138,7 @@ RANGES = [
     (f"{VELOCITY}.duration_s", 0, "a finite number > 0 and <= 86400 s"),
     (f"{TURN}.rate_deg_s", 61.0, "a finite number >= -60 and <= 60 deg/s"),
     (f"{TURN}.angle_deg", 5e-324, "a finite number >= 0.01 and <= 36000 deg"),
-    ("law.kind", "boids", "one of starling, paper"),
+    ("law.kind", "boids", "one of starling, paper, intent"),
     ("law.hold", "second", "'damped', 'zero' or 'first'"),
     ("law.k_s", -0.1, "a finite number >= 0 and <= 100"),
     ("law.a_max_m_s2", 1e-9, "a finite number >= 2 and <= 20 m/s^2"),

@@ -19,7 +19,7 @@ from companion.core.neighbours.table import (
     UNCERTAINTY_GROWTH_MAX_M,
     PeerTable,
 )
-from companion.core.prediction import HoldKind
+from companion.core.prediction import HoldKind, PlainHold
 from companion.core.safety.filter import nearest_hypothesis
 from companion.core.trajectory.fleet import FleetTrajectory
 from companion.core.trajectory.history import TrajectoryHistory
@@ -37,7 +37,7 @@ MOTION = PeerMotion(
     speed_m_s=8.0, lag_s=0.0, latency_s=0.1, t_min_s=0.05, t_max_s=5.0,
 )  # fmt: skip
 LIMITS = PeerLimits(
-    hold="damped", hold_damping_s=0.7, range_m=100.0, stale_after_s=12.0, heartbeat_s=5.7, isolated_flight_s=5.0,
+    hold=PlainHold("damped", 0.7), range_m=100.0, stale_after_s=12.0, heartbeat_s=5.7, isolated_flight_s=5.0,
     notice_lost_s=1.5, notice_spread_s=0.5,
     uncertainty_m=0.4, motion=MOTION, digest_size=3,
 )  # fmt: skip
@@ -226,7 +226,7 @@ def test_receiver_predicts_what_the_sender_compares_with(
     kind: HoldKind, phase: Phase, shift: Ned, drift: Ned, age_s: float
 ) -> None:
     turn = column_at_1_m_s(legs=(TurnLeg(0.1, inf),), heading_follows_turns=True)
-    t = table(turn, hold=kind)
+    t = table(turn, hold=PlainHold(kind, 0.7))
     r = turn.reference(3, ns(20.0))
     sent = PeerSample(
         3, ns(20.0), Ned(*map(sum, zip(r.position_ned_m, shift, strict=True))),
@@ -237,7 +237,7 @@ def test_receiver_predicts_what_the_sender_compares_with(
         sent, (r.position_ned_m, r.velocity_ned_m_s), turn.reference(3, ns(20.0 + age_s)), ns(20.0 + age_s), t.limits
     )
     n = predicted(t, 20.0 + age_s)[3]
-    assert (n.position_ned_m, n.velocity_ned_m_s) == sender
+    assert (n.position_ned_m, n.velocity_ned_m_s, n.told) == sender
     assert n.age_s == pytest.approx(age_s, abs=1e-9)
 
 
@@ -414,7 +414,7 @@ def test_after_a_new_motion_old_samples_are_held_under_it() -> None:
     then, now = (t.history.reference(2, ns(x)) for x in (5.0, 9.0))
     expected = predict_sample(s, (then.position_ned_m, then.velocity_ned_m_s), now, ns(9.0), t.limits)
     n = predicted(t, 9.0)[2]
-    assert (n.position_ned_m, n.velocity_ned_m_s) == expected
+    assert (n.position_ned_m, n.velocity_ned_m_s, n.told) == expected
 
 
 # -- gates -----------------------------------------------------------------------------------------------------------

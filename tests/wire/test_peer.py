@@ -48,10 +48,25 @@ vectors = st.builds(Ned, singles, singles, singles)
 rates_and_speeds = st.floats(-COMMON_MAX, COMMON_MAX, width=32)
 commons = st.none() | st.builds(CommonMotion, *[rates_and_speeds] * 4)
 samples = st.builds(PeerSample, bytes_8, times, vectors, vectors, words, st.sampled_from(Phase), commons)
+
+
+def with_numbers(message: PeerMessage, numbers: list[float]) -> PeerMessage:
+    """A message of a fleet whose law tells so many numbers with each sample, not the same of each."""
+    own, *others = (
+        s._replace(told=tuple(numbers[-k % len(numbers) :] + numbers[: -k % len(numbers)]) if numbers else ())
+        for k, s in enumerate((message.sample, *message.digest))
+    )
+    return replace(message, sample=own, digest=tuple(others))
+
+
 near_ids = st.sets(bytes_8, max_size=12).map(lambda ids: tuple(sorted(ids)))
 messages = st.builds(
-    PeerMessage, words, words, times, bytes_8, samples, st.lists(samples, max_size=6).map(tuple), near_ids,
-    st.booleans(), st.lists(singles, max_size=FIELDS_MAX).map(tuple),
+    with_numbers,
+    st.builds(
+        PeerMessage, words, words, times, bytes_8, samples, st.lists(samples, max_size=6).map(tuple), near_ids,
+        st.booleans(),
+    ),
+    st.lists(singles, max_size=FIELDS_MAX),
 )  # fmt: skip
 
 metres = st.floats(-PLACE_MAX_M, PLACE_MAX_M)
@@ -117,6 +132,12 @@ def test_a_common_motion_costs_17_bytes_a_sample_and_one_for_all() -> None:
     assert len(encode_state(message)) == len(encode_state(MESSAGE)) + 1 + 2 * 17
 
 
+def test_a_laws_numbers_cost_4_bytes_each_a_sample_and_one_for_all() -> None:
+    told = SAMPLE._replace(told=(1.0, 2.0))
+    message = replace(MESSAGE, sample=told, digest=(told, told))
+    assert len(encode_state(message)) == len(encode_state(MESSAGE)) + 1 + 3 * 8
+
+
 @pytest.mark.parametrize(
     ("tail", "kind"),
     [
@@ -153,7 +174,7 @@ def test_a_flag_that_nobody_knows_is_refused() -> None:
 
 @pytest.mark.parametrize("count", [0, 2, 4, FIELDS_MAX + 1, 255])
 def test_numbers_of_a_law_that_are_not_as_many_as_they_say_are_refused(count: int) -> None:
-    payload = bytearray(encode_state(replace(MESSAGE, told=(1.0, 2.0, 3.0))))
+    payload = bytearray(encode_state(replace(MESSAGE, sample=SAMPLE._replace(told=(1.0, 2.0, 3.0)), digest=())))
     payload[-13] = count
     with pytest.raises(WireError, match="length"):
         decode_state(bytes(payload))
@@ -162,7 +183,7 @@ def test_numbers_of_a_law_that_are_not_as_many_as_they_say_are_refused(count: in
 @pytest.mark.parametrize(("number", "kind"), [(nan, "not finite"), (inf, "not finite"), (2e6, "out of range")])
 def test_a_number_of_a_law_that_is_none_is_refused(number: float, kind: str) -> None:
     with pytest.raises(WireError, match=kind):
-        decode_state(encode_state(replace(MESSAGE, told=(0.0, number))))
+        decode_state(encode_state(replace(MESSAGE, sample=SAMPLE._replace(told=(0.0, number)), digest=())))
 
 
 @given(messages, st.data())

@@ -25,14 +25,14 @@ class Wanted(NamedTuple):
 
     def command(self, reference: Reference) -> Command:
         """What the safety filter is given: place, speed and heading are those of the plan, whatever the law."""
-        return Command(self.acceleration_ned_m_s2, *reference)
+        return Command(self.acceleration_ned_m_s2, *reference[:4])
 
 
 class Law(Protocol):
     """What a vehicle flies toward its slot and among its neighbours; it keeps no distance by itself.
 
     A law may keep a state of its own (an anchor, an estimate of the common velocity); `ego.time_ns` is the time. What
-    it is given cannot be changed. How a silent peer is predicted is not the law's: `law.hold` says it for all.
+    it is given cannot be changed. How a silent peer is predicted its table says (`core.prediction.Hold`).
     """
 
     def command(
@@ -55,5 +55,5 @@ class Law(Protocol):
         ...
 
     def tell(self) -> tuple[float, ...]:
-        """These numbers now, one for each field. A peer's latest are its `Neighbour.told` (as float32)."""
+        """These numbers now, one for each field. A peer's are its `Neighbour.told` (sent as float32)."""
         ...

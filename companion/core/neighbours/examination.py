@@ -45,7 +45,7 @@ def explains(track: Track, sample: PeerSample, foresight: Foresight) -> bool:
     high = before.position_ned_m.down < -ALOFT_M
     if high and before.phase in FLYING_PHASES - {Phase.LANDING} and stands(after):
         return False  # nobody lands without having been landing
-    p, v = foresight.at(before, reference_then, after.time_ns)
+    p, v, _ = foresight.at(before, reference_then, after.time_ns)
     dt_s = min((after.time_ns - before.time_ns) * 1e-9, UNTOLD_S)
     reach = min(0.5 * PEER_ACCELERATION_M_S2 * dt_s, PEER_SPEED_M_S) * dt_s
     margin = max(PEER_MARGIN_M, foresight.limits.uncertainty_m)
@@ -62,7 +62,7 @@ def leads_to(track: Track, sample: PeerSample, foresight: Foresight) -> bool:
     dt_s = abs(sample.time_ns - track.sample.time_ns) * 1e-9
     if not dist(track.sample.position_ned_m, q) <= PEER_MARGIN_M + PEER_SPEED_M_S * dt_s:
         return False
-    p, _ = foresight.at(track.sample, track.reference_then, sample.time_ns)
+    p = foresight.at(track.sample, track.reference_then, sample.time_ns).position_ned_m
     return aloft(sample) or hypot(p.north - q.north, p.east - q.east) <= LOST_NEAR_M
 
 

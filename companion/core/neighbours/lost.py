@@ -37,14 +37,14 @@ def possible_path(track: Track, fleet_ns: int, foresight: Foresight) -> tuple[li
         ends = {Phase.ARMED: top, Phase.CLIMBING: top, Phase.LANDING: ground}
         if sample.phase in ends:
             return [last, last._replace(down=ends[sample.phase])], ZERO
-        p, v = predict_sample(sample, (ZERO, ZERO), _NOWHERE, fleet_ns, foresight.limits)
+        p, v, _ = predict_sample(sample, (ZERO, ZERO), _NOWHERE, fleet_ns, foresight.limits)
         if sample.phase is Phase.RELEASED or sample.phase in FILTERED_PHASES:
             return [last, p], v
         return [last, p._replace(down=max(p.down, ground))], ZERO
     end_ns = max(min(fleet_ns, track.flown_ns), track.stopped_ns)
     while (next_ns := track.stopped_ns + len(track.path) * PATH_STEP_NS) < end_ns or not track.path:
-        track.path.append(foresight.at(sample, track.reference_then, next_ns)[0])
-    end, velocity = foresight.at(sample, track.reference_then, end_ns)
+        track.path.append(foresight.at(sample, track.reference_then, next_ns).position_ned_m)
+    end, velocity, _ = foresight.at(sample, track.reference_then, end_ns)
     return [*track.path, end], velocity if fleet_ns < track.flown_ns else ZERO
 
 

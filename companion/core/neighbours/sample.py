@@ -4,10 +4,10 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
-from companion.core.frames import Ned, new
+from companion.core.frames import Ned
 from companion.core.monitor import PeerMotion
 from companion.core.neighbours.graph import NeighbourKind
-from companion.core.prediction import HoldKind, axis, common_way, weights
+from companion.core.prediction import Held, Hold, common_way, weights
 from companion.core.trajectory.fleet import Reference
 from companion.core.trajectory.history import TrajectoryHistory
 from companion.core.values import AIRBORNE_PHASES, FORMATION_PHASES, ZERO, PeerSample, Phase
@@ -23,8 +23,8 @@ ALOFT_M = 2.0
 class PeerLimits:
     """What the table needs to know of the configuration."""
 
-    hold: HoldKind
-    hold_damping_s: float
+    hold: Hold
+    """of vehicles in formation"""
     range_m: float
     stale_after_s: float
     """a peer silent for longer is stale: beyond T_max with its jitter"""
@@ -48,33 +48,29 @@ class PeerLimits:
 
 def predict_sample(
     sample: PeerSample, reference_then: tuple[Ned, Ned], reference: Reference, fleet_ns: int, limits: PeerLimits
-) -> tuple[Ned, Ned]:
-    """Position and velocity at `fleet_ns` as a sample foretells them: what receivers use and senders compare with.
+) -> Held:
+    """What a sample foretells for `fleet_ns`: what receivers use and senders compare with.
 
     `reference_then` is p_ref and v_d of the sender's slot at the sample's time, `reference` the one at `fleet_ns`. A
-    vehicle in formation is held by the configured hold. One that climbs or lands stays over its spot, and its vertical
+    vehicle in formation is held by the law's hold. One that climbs or lands stays over its spot, and its vertical
     speed fades, since it ends at its altitude or on the ground; the velocity of one that flies by itself, or under
     somebody else, fades too. Whoever has landed or waits to be armed stands.
     """
     tau_s = max(0.0, (fleet_ns - sample.time_ns) * 1e-9)
     p, v = sample.position_ned_m, sample.velocity_ned_m_s
     if sample.phase in FORMATION_PHASES:
-        w = weights(limits.hold, tau_s, limits.hold_damping_s)
-        then_p, then_v = reference_then
-        now_p, now_v = reference.position_ned_m, reference.velocity_ned_m_s
-        x, vx = axis(p.north, v.north, then_p.north, then_v.north, now_p.north, now_v.north, w)
-        y, vy = axis(p.east, v.east, then_p.east, then_v.east, now_p.east, now_v.east, w)
-        z, vz = axis(p.down, v.down, then_p.down, then_v.down, now_p.down, now_v.down, w)
-        return new(Ned, (x, y, z)), new(Ned, (vx, vy, vz))
+        return limits.hold.at(sample, reference_then, reference, tau_s)
     if sample.phase in (Phase.ARMED, Phase.CLIMBING, Phase.LANDING):
         w = weights("damped", tau_s, VERTICAL_DAMPING_S)
-        return Ned(p.north, p.east, p.down + w.position * v.down), Ned(0.0, 0.0, w.velocity * v.down)
+        above = Ned(p.north, p.east, p.down + w.position * v.down)
+        return Held(above, Ned(0.0, 0.0, w.velocity * v.down), sample.told)
     if sample.phase in (Phase.DETACHED, Phase.RELEASED, Phase.IDLE):
         # IDLE too: a companion that starts in flight does not steer.
         w = weights("damped", tau_s, FREE_DAMPING_S)
         k, f = w.position, w.velocity
-        return Ned(p.north + k * v.north, p.east + k * v.east, p.down + k * v.down), Ned(*(f * x for x in v))
-    return p, ZERO
+        gone = Ned(p.north + k * v.north, p.east + k * v.east, p.down + k * v.down)
+        return Held(gone, Ned(*(f * x for x in v)), sample.told)
+    return Held(p, ZERO, sample.told)
 
 
 def aloft(sample: PeerSample) -> bool:
@@ -99,14 +95,12 @@ class Foresight(NamedTuple):
         reference = self.history.reference(sample.vehicle_id, sample.time_ns)
         return reference.position_ned_m, reference.velocity_ned_m_s
 
-    def at(self, sample: PeerSample, reference_then: tuple[Ned, Ned], fleet_ns: int) -> tuple[Ned, Ned]:
-        """Position and velocity at a time."""
+    def at(self, sample: PeerSample, reference_then: tuple[Ned, Ned], fleet_ns: int) -> Held:
+        """What is foretold for a time."""
         reference = self.history.reference(sample.vehicle_id, fleet_ns)
         return self.under(reference, sample, reference_then, fleet_ns)
 
-    def under(
-        self, reference: Reference, sample: PeerSample, reference_then: tuple[Ned, Ned], fleet_ns: int
-    ) -> tuple[Ned, Ned]:
+    def under(self, reference: Reference, sample: PeerSample, reference_then: tuple[Ned, Ned], fleet_ns: int) -> Held:
         """The same, where the slot's shared reference at that time is known."""
         if sample.common is not None and sample.phase in FORMATION_PHASES:
             reference_then, reference = self._with_common_motion(reference, sample, reference_then, fleet_ns)

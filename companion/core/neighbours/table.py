@@ -94,8 +94,7 @@ class PeerTable:
         if reason is None:
             reason = self._hear(self._peers[sample.vehicle_id], sample, message.boot_id, now)
             if reason is None:
-                peer = self._peers[sample.vehicle_id]
-                peer.due_soon, peer.told = message.due_soon, message.told
+                self._peers[sample.vehicle_id].due_soon = message.due_soon
         if reason is not None:
             self.rejected[reason] += 1
             return reason
@@ -199,8 +198,8 @@ class PeerTable:
         if track.own is not None and track.lost_at_ns is None:
             said, reference_then = track.own
             if now.fleet_ns - said.time_ns <= (self.limits.heartbeat_s + silence.HEARTBEAT_MARGIN_S) * 1e9:
-                foreseen, _ = self.foresight.at(said, reference_then, sample.time_ns)
-                moved = dist(foreseen, sample.position_ned_m) > HEARSAY_M
+                foreseen = self.foresight.at(said, reference_then, sample.time_ns)
+                moved = dist(foreseen.position_ned_m, sample.position_ned_m) > HEARSAY_M
                 if moved or (said.phase in FORMATION_PHASES) is not (sample.phase in FORMATION_PHASES):
                     return False
         track.take(sample, self.foresight.reference_then(sample))
@@ -364,7 +363,7 @@ class PeerTable:
         tau_s = max(0.0, (now.fleet_ns - sample.time_ns) * 1e-9)
         if now.fleet_ns > track.due_ns and track.lost_at_ns is None and aloft(sample):
             track.fall_silent()
-        uncertainty = limits.uncertainty_m
+        uncertainty, told = limits.uncertainty_m, sample.told
         other_end: Ned | None = None
         lost_at_ns = track.lost_at_ns
         if lost_at_ns is not None and aloft(sample):
@@ -372,7 +371,7 @@ class PeerTable:
             uncertainty += min(UNCERTAINTY_GROWTH_M_S * max(since_s, 0.0), UNCERTAINTY_GROWTH_MAX_M)
             position, velocity, other_end = nearest_piece(track, ego_ned_m, now.fleet_ns, self.foresight)
         else:
-            position, velocity = self.foresight.under(shared, sample, track.reference_then, now.fleet_ns)
+            position, velocity, told = self.foresight.under(shared, sample, track.reference_then, now.fleet_ns)
             if peer.due_soon:
                 uncertainty = near_bound_m(tau_s, uncertainty, limits.motion)
             if not follows and aloft(sample) and sample.phase not in FLYING_PHASES:
@@ -390,6 +389,6 @@ class PeerTable:
             Neighbour,
             (
                 sample.vehicle_id, position, velocity, offset, tau_s, sound, sound, uncertainty, other_end,
-                reference.velocity_ned_m_s, reference.acceleration_ned_m_s2, peer.told,
+                reference.velocity_ned_m_s, reference.acceleration_ned_m_s2, told,
             ),
         )  # fmt: skip

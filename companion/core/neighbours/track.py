@@ -78,5 +78,3 @@ class Peer:
     """until then another place of it is not noted again: a liar writes no log"""
     due_soon: bool = False
     """its last message came in near mode, so that one that is missing is known to be"""
-    told: tuple[float, ...] = ()
-    """what its law said in that message"""

@@ -42,6 +42,8 @@ class Reference(NamedTuple):
     velocity_ned_m_s: Ned
     acceleration_ned_m_s2: Ned
     heading_rad: float
+    shared: bool = True
+    """false: no motion is shared, and the place is where the neighbours put it"""
 
 
 class TrajectoryState(NamedTuple):
@@ -74,7 +76,7 @@ class TrajectoryState(NamedTuple):
         dn, de = c * forward - s * right, s * forward + c * right
         if rate == bend == m1 == m2 == 0.0:
             # Slots at rest in a formation that does not turn, which is most of a flight: all move as the centre does.
-            return new(Reference, (new(Ned, (p.north + dn, p.east + de, p.down + d0 + m * dd)), v, a, heading))
+            return new(Reference, (new(Ned, (p.north + dn, p.east + de, p.down + d0 + m * dd)), v, a, heading, True))
         wn, we = c * df - s * dr, s * df + c * dr
         return Reference(
             Ned(p.north + dn, p.east + de, p.down + d0 + m * dd),

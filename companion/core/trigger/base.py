@@ -34,12 +34,14 @@ class Situation(NamedTuple):
     sent_ns: int
     """when the last message was sent, by the same clock"""
     told: tuple[float, ...] = ()
-    """the law's own numbers (`Law.fields`) in the last message"""
+    """the law's own numbers (`Law.fields`) as the peers take them to be by the last message"""
     tells: tuple[float, ...] = ()
     """the same as they would be sent now"""
     error_common_2: float = 0.0
     """squared error of what the peers take for the own estimate of the common velocity, where no motion is shared
     (m^2/s^2)"""
+    error_told_m: float = 0.0
+    """how far off the peers are by the law's own numbers alone (`Hold.told_error_m`)"""
 
 
 class Trigger(Protocol):

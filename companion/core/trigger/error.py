@@ -2,12 +2,14 @@
 
 send when |e_p|^2 + gamma |e_v|^2 >= epsilon^2 + min(kappa |residual|, 0.1 m)^2
 
-and, where no motion is shared, when |e_nu| >= epsilon_nu, the error of the published common velocity.
+and, where no motion is shared, when |e_nu| >= epsilon_nu, the error of the published common velocity; and, where the
+law publishes its intent (`core.law.intent`), when the intended place is off by max(epsilon_c, kappa_c |residual|).
 """
 
 from math import hypot
 from typing import NamedTuple
 
+from companion.core.law.intent import IntentTrigger, anchor_exceeds
 from companion.core.monitor import PeerMotion, prediction_error_bound_m
 from companion.core.trigger.base import Situation
 
@@ -22,10 +24,16 @@ class ErrorTrigger(NamedTuple):
     gamma_s2: float
     kappa: float
     epsilon_nu_m_s: float = 0.03
+    epsilon_c_m: float = 0.005
+    kappa_c: float = 0.8
 
     def fires(self, now: Situation) -> bool:
-        """Eq. (4) with the threshold epsilon, raised by the residual; and the common velocity's own threshold."""
+        """Eq. (4) with the threshold epsilon, raised by the residual; the common velocity's own threshold; the
+        intended place's."""
         if now.error_common_2 >= self.epsilon_nu_m_s * self.epsilon_nu_m_s:
+            return True
+        told_m = now.error_told_m
+        if anchor_exceeds(told_m * told_m, now.mean_residual_2, IntentTrigger(self.epsilon_c_m, self.kappa_c)):
             return True
         return exceeds(now.error_position_2, now.error_velocity_2, now.mean_residual_2, self)
 

@@ -53,7 +53,7 @@ class SpringsLaw:
     ) -> Wanted:
         """The wanted acceleration, and the mean residual to those that are heeded."""
         t, p, v = self.table, ego.position_ned_m, ego.velocity_ned_m_s
-        r, rv, ra, _ = reference
+        r, rv, ra = reference[:3]
         north, east = _saturated(p.north - r.north, p.east - r.east)
         u_north = ra.north - t.damping_per_s * (v.north - rv.north) - t.slot_per_s2 * north
         u_east = ra.east - t.damping_per_s * (v.east - rv.east) - t.slot_per_s2 * east
