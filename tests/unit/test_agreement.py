@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from companion.config import FleetConfig, load
 from companion.core.frames import Ned
 from companion.core.law.evasion import FLEE_SPEED_M_S, GO_BACK_S, Threat
+from companion.core.neighbours.gates import GATE_VELOCITY_M_S, outliers
 from companion.core.neighbours.sample import Foresight
 from companion.core.neighbours.table import PeerTable
 from companion.core.prediction import common_way
@@ -248,6 +249,22 @@ def test_the_slot_is_where_the_neighbours_are_wherever_the_shared_motion_began()
     assert one.agreement.centre.position_ned_m == pytest.approx(
         Ned(centre.north + away.north, centre.east + away.east, centre.down)
     )
+
+
+@pytest.mark.parametrize(
+    ("said", "gated"),
+    [
+        ((2.0, 0.0), frozenset()), ((2.0 - GATE_VELOCITY_M_S + 0.01, 0.0), frozenset()),
+        ((2.0 - GATE_VELOCITY_M_S - 0.01, 0.0), frozenset({4})), (None, frozenset({4})),
+    ],
+)  # fmt: skip
+def test_one_that_flies_as_it_says_is_no_outlier_however_the_others_fly(
+    said: tuple[float, float] | None, gated: frozenset[int]
+) -> None:
+    stands = [Neighbour(i, Ned(4.0 * i, 0.0, 0.0), ZERO, Ned(-4.0 * i, 0.0, 0.0), 0.0, True, True, 0.3) for i in (2, 3)]
+    flees = Neighbour(4, Ned(16.0, 0.0, 0.0), Ned(2.0, 0.0, 0.0), Ned(-16.0, 0.0, 0.0), 0.0, True, True, 0.3)
+    assert outliers([*stands, flees], ZERO, {2: (0.0, 0.0), 3: (0.0, 0.0), 4: said}) == gated
+    assert outliers([*stands, flees], ZERO) == {4}
 
 
 # -- what is fled ------------------------------------------------------------------------------------------------------
