@@ -142,7 +142,7 @@ class Setup:
     start_velocity_m_s: float = 0.1
     """and with the plan's velocity plus up to this much on each axis"""
     start_separation_m: float = 0.0
-    """starts are drawn again until no two are closer than this (up to 200 agents)"""
+    """starts are drawn again until no two are closer than this (up to 300 agents)"""
     scrambled: bool = False
     """agents start at each other's slots, so that their paths cross"""
 

@@ -2,7 +2,7 @@
 
 `Setup` says everything about a run; `run(setup, seed)` returns what happened. Every agent has its own random streams,
 drawn from seed and index alone: the same seed gives the same disturbances, noise and losses whatever the law does, so
-that laws are compared under equal luck. Up to 200 agents every ordered pair may be kept apart (loss, delay); above, a
+that laws are compared under equal luck. Up to 300 agents every ordered pair may be kept apart (loss, delay); above, a
 sorted list of the neighbours within range, with a skin of 1 m, is rebuilt when relative motion has used the skin up,
 and no array has N x N entries.
 """
