@@ -15,6 +15,7 @@ FLEETS = ("test_fleet_up.py", "test_missing.py")
 TOGETHER = ("test_flight.py", "test_faults.py", "test_damaged_recordings.py", "test_leaderless.py")
 """files of tests/lockstep whose tests look at flights that they share"""
 COMPILED = (
+    "test_evasion_study.py",
     "test_foreign_study.py",
     "test_study.py",
     "test_swarm.py",

@@ -29,7 +29,7 @@ from companion.operator.newest import newest_motion, whereabouts
 from companion.operator.preflight import FleetReport, fleet_report
 from companion.operator.roster import RETRY_S, STATUS_TIMEOUT_S, Link, Roster
 from companion.terminal import one_line
-from companion.wire.operator import ENDING, Answer, Command, PreflightReport, Status, Verb, decode, encode
+from companion.wire.operator import ENDING, Answer, Command, PreflightReport, Scare, Status, Verb, decode, encode
 from companion.wire.peer import leg_to_json, motion_to_json
 
 COMMAND_LEAD_NS = 2_000_000_000
@@ -99,7 +99,7 @@ class Operator:
 
     def command(
         self, verb: Verb, vehicle: int | Iterable[int] | None = None, *, confirm: bool = False,
-        motion: FleetTrajectory | None = None, leg: Leg | None = None,
+        motion: FleetTrajectory | None = None, leg: Leg | None = None, threat: Scare | None = None,
     ) -> Answers:  # fmt: skip
         """A verb to every vehicle, to one or to some, asked again until each has answered or the time is over.
 
@@ -122,6 +122,7 @@ class Operator:
                 confirm=confirm,
                 motion=None if motion is None else motion_to_json(motion),
                 leg=None if leg is None else leg_to_json(leg),
+                threat=threat,
             )
             last = self._ask(ids, command, timeout_s, None if motion is None else motion.revision)
             accepted += last.accepted
@@ -228,6 +229,18 @@ class Operator:
         """Some vehicles are told where to draw the fleet, which flies no shared motion; None: nowhere any more."""
         self.status()
         return self.command("wish", vehicles, leg=leg)
+
+    def scare(self, threat: Scare, now_ns: int) -> Answers:
+        """Every vehicle is told of a threat, which those near it flee; RefusedError where they share a motion, and then
+        nobody is told."""
+        statuses = self.status()
+        self.roster.refuse_doubles(self.ids, "scare")
+        newest = newest_motion(statuses, now_ns).motion
+        if newest is None:
+            raise RefusedError("no vehicle answers; is the fleet up, and is this its fleet.toml?")
+        if not newest.free_at(now_ns):
+            raise RefusedError("the fleet flies a motion that all share, and only a free one flees: move --free first")
+        return self.command("scare", threat=threat)
 
     def move(self, leg: Leg, now_ns: int) -> Answers:
         """Another motion of the formation; RefusedError before it has formed by itself."""

@@ -38,7 +38,7 @@ FLEET_TOML = Path("fleet.toml")
 def mount(app: typer.Typer) -> None:
     """Add every verb to a command, and `init`."""
     app.command()(init)
-    for verb in (status, preflight, takeoff, land, rtl, hold, form, move, release, resume, kill):
+    for verb in (status, preflight, takeoff, land, rtl, hold, form, move, scare, release, resume, kill):
         app.command(rich_help_panel=PANEL)(verb)
 
 
@@ -209,6 +209,48 @@ def move(
         return operator.goto(*goto, altitude, speed, now_ns)
 
     command(fleet, vehicles, "move", act)
+
+
+def scare(
+    at: Annotated[
+        tuple[float, float],
+        typer.Option(metavar="NORTH EAST", help="Where the threat is now (m from the fleet origin), 10 000 m at most."),
+    ],
+    velocity: Annotated[
+        tuple[float, float],
+        typer.Option(metavar="NORTH EAST", help="How it goes on (m/s), 30 m/s at most each way; left out: it stands."),
+    ] = (0.0, 0.0),
+    radius: Annotated[
+        float, typer.Option(min=1, max=50, help="Who is nearer than this to its way of the next 2 s flees (m).")
+    ] = 10.0,
+    lasts: Annotated[float, typer.Option("--for", min=0.5, max=60, help="For so long it is there (s).")] = 10.0,
+    fleet: FleetFile = FLEET_TOML,
+    vehicles: Vehicles = None,
+) -> None:
+    """Have vehicles flee a point, in a fleet that flies without a shared motion.
+
+    Those near it fly away from its way; the others see no threat and follow what these do. Once it has gone they come
+    back into formation. Fence, distances and speed limits hold as ever. To end it at once: hold.
+    Examples: scare --at 0 0; scare --at -40 5 --velocity 6 0 --radius 12 --for 15.
+    """
+    from companion.wire.operator import THREAT_PLACE_MAX_M, THREAT_SPEED_MAX_M_S, Scare
+
+    for name, pair, most, unit in (
+        ("at", at, THREAT_PLACE_MAX_M, "m"), ("velocity", velocity, THREAT_SPEED_MAX_M_S, "m/s"),
+    ):  # fmt: skip
+        if not all(abs(x) <= most for x in pair):
+            came = " ".join(f"{x:g}" for x in pair)
+            raise ConfigError(f"scare --{name}: each number must be within {most:g} {unit}, got {came}")
+
+    def act(operator: "Operator") -> "Answers":
+        now_ns = time.time_ns()
+        threat = Scare(
+            begins_ns=now_ns, north_m=at[0], east_m=at[1], north_m_s=velocity[0], east_m_s=velocity[1],
+            radius_m=radius, lasts_s=lasts,
+        )  # fmt: skip
+        return operator.scare(threat, now_ns)
+
+    command(fleet, vehicles, "scare", act)
 
 
 def release(

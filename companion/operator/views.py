@@ -107,7 +107,8 @@ def status_table(
 def _remarks(status: Status) -> str:
     waiting = status.phase in ("idle", "landed") and not status.armed
     rejected = sum(status.rejected.values())
-    said = [*([status.killed] if status.killed else []), *status.failsafes, *(status.ready if waiting else [])]
+    flees = ["flees"] if status.flees else []
+    said = [*([status.killed] if status.killed else []), *flees, *status.failsafes, *(status.ready if waiting else [])]
     return one_line("; ".join([*said, *([f"{rejected} rejected"] if rejected else [])]), REMARKS_MAX)
 
 

@@ -243,7 +243,7 @@ class Agent:
         plan, part = self.history.at(now.fleet_ns), self.phase in FORMATION_PHASES
         shared = plan.state_at(now.fleet_ns)
         slot = shared.slot(plan.slots[self.id])
-        formation = self.agreement.advance(plan, shared, self._neighbours, part, now)
+        formation = self.agreement.advance(plan, shared, ego, self._neighbours, part, now)
         neighbours = self._predict(ego, formation, now)
         formation = self.agreement.place(plan, formation, ego, neighbours, part, now)
         own = slot if formation is shared else formation.slot(plan.slots[self.id])._replace(shared=False)
@@ -293,7 +293,8 @@ class Agent:
 
     def _command(self, ego: VehicleState, reference: Reference, neighbours: Sequence[Neighbour]) -> Wanted:
         """What the law wants, and the formation's mean residual about this vehicle."""
-        return self.law.command(ego, reference, neighbours, alone=self.supervisor.detached)
+        alone = self.supervisor.detached or self.agreement.flees
+        return self.law.command(ego, reference, neighbours, alone=alone)
 
     def _constrain(
         self, command: Command, ego: VehicleState, neighbours: Sequence[Neighbour], dt_s: float

@@ -6,6 +6,7 @@ from typing import NamedTuple
 from companion.config import FleetConfig
 from companion.core.counts import Counts, Refusal
 from companion.core.frames import Ned, geodetic_to_ned
+from companion.core.law.evasion import Threat
 from companion.core.neighbours.table import PeerTable
 from companion.core.trajectory.history import TrajectoryHistory
 from companion.core.values import FLYING_PHASES, Instant, Phase
@@ -25,6 +26,7 @@ from companion.wire.operator import (
     Command,
     Place,
     PreflightReport,
+    Scare,
     Status,
     Whereabouts,
     decode_command,
@@ -35,6 +37,9 @@ from companion.wire.peer import leg_from_json, motion_to_json
 
 FAILSAFES_SHOWN_MAX = 20
 """the last ones stand in a status: one that comes again and again must not make it too large to be sent"""
+SCARED_AHEAD_S = 10.0
+"""what is fled begins no later than so long from now: people would forget a threat for later, vehicles would not"""
+SHARED = "the fleet flies a motion that all share"
 REJECTED = tuple(f"command: {kind}" for kind in ORDER_FAULTS)
 """what the port counts"""
 
@@ -111,6 +116,8 @@ class OperatorPort:
                 return self.supervisor.kill(now) if command.confirm else "kill needs its confirmation"
             case "wish":
                 return self._wish(command.leg, now)
+            case "scare":
+                return self._scare(command.threat, now)
         return self.plans.on_command(command.motion, now)
 
     def _take_off(self, now: Instant) -> str | None:
@@ -133,11 +140,28 @@ class OperatorPort:
         except WireError as error:
             return str(error)
         if self.agreement.centre is None:
-            return "the fleet flies a motion that all share: command that one, or free it first"
+            return f"{SHARED}: command that one, or free it first"
         reason = self.agreement.refusal(leg)
         if reason is None:
             self.agreement.inform((leg,), now.fleet_ns)
         return reason
+
+    def _scare(self, threat: Scare | None, now: Instant) -> str | None:
+        if threat is None:
+            return "scare needs a threat"
+        if self.agreement.centre is None:
+            return f"{SHARED}: only a free fleet flees, free it first"
+        since_s = (now.fleet_ns - threat.begins_ns) * 1e-9
+        if not -SCARED_AHEAD_S <= since_s <= threat.lasts_s:
+            return (
+                f"the threat begins {-since_s:.1f} s from now and lasts {threat.lasts_s:g} s: it must not be over, nor "
+                f"more than {SCARED_AHEAD_S:g} s ahead (is the operator's clock right?)"
+            )
+        self.agreement.scare(
+            Threat(threat.north_m, threat.east_m, threat.north_m_s, threat.east_m_s, threat.radius_m, threat.lasts_s),
+            threat.begins_ns,
+        )
+        return None
 
     def _refuse(self, refusal: Refusal, in_order: bool = True) -> bytes:
         self.rejected[f"command: {refusal.kind}"] += 1
@@ -242,6 +266,7 @@ class OperatorPort:
             motion=motion_to_json(newest),
             centre=None if self.agreement.centre is None else Whereabouts(*self.agreement.centre),
             informed=self.agreement.wish is not None,
+            flees=self.agreement.flees,
             lambda2=None if graph is None else graph.lambda2,
             graph_edge=None if graph is None else graph.edge,
         )

@@ -28,7 +28,7 @@ PLACES_MAX: Final = 8
 """so many companions of one vehicle id may be addressed at a time"""
 CLOCK_QUESTION: Final = b"clock"
 
-Verb = Literal["takeoff", "land", "motion", "wish", "release", "resume", "kill"]
+Verb = Literal["takeoff", "land", "motion", "wish", "scare", "release", "resume", "kill"]
 VERBS: Final[tuple[Verb, ...]] = get_args(Verb)
 ENDING: Final[frozenset[Verb]] = frozenset({"land", "release", "kill"})
 """what ends a flight"""
@@ -47,6 +47,14 @@ _SystemId = Annotated[int, Field(ge=0, le=255)]
 _Coordinate = Annotated[float, Field(ge=-1e8, le=1e8, allow_inf_nan=False)]
 """metres that every true answer keeps by far, and within which what is computed from it cannot overflow"""
 _Point = tuple[_Coordinate, _Coordinate, _Coordinate]
+THREAT_PLACE_MAX_M: Final = 10_000.0
+"""north and east of a threat, from the fleet origin"""
+THREAT_SPEED_MAX_M_S: Final = 30.0
+"""of each component of its velocity"""
+THREAT_RADIUS_M: Final = (1.0, 50.0)
+THREAT_LASTS_S: Final = (0.5, 60.0)
+_Place = Annotated[float, Field(ge=-THREAT_PLACE_MAX_M, le=THREAT_PLACE_MAX_M, allow_inf_nan=False)]
+_Speed = Annotated[float, Field(ge=-THREAT_SPEED_MAX_M_S, le=THREAT_SPEED_MAX_M_S, allow_inf_nan=False)]
 
 
 class Place(NamedTuple):
@@ -58,6 +66,22 @@ class Place(NamedTuple):
     """flights begun since the companion's start: take-offs and resumptions"""
     obeyed: _Count
     """commands obeyed since then"""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scare:
+    """What is fled (`core.law.evasion`), on the level; fleet frame."""
+
+    begins_ns: _Count
+    """fleet time"""
+    north_m: _Place
+    """where it is then"""
+    east_m: _Place
+    north_m_s: _Speed = 0.0
+    east_m_s: _Speed = 0.0
+    radius_m: Annotated[float, Field(ge=THREAT_RADIUS_M[0], le=THREAT_RADIUS_M[1], allow_inf_nan=False)]
+    """within which it is fled"""
+    lasts_s: Annotated[float, Field(ge=THREAT_LASTS_S[0], le=THREAT_LASTS_S[1], allow_inf_nan=False)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,6 +100,8 @@ class Command:
     """of `motion`: a fleet's trajectory (`wire.peer.motion_from_json`)"""
     leg: Any = None
     """of `wish`: where one vehicle is to draw the fleet (`wire.peer.leg_from_json`); None: nowhere any more"""
+    threat: Scare | None = None
+    """of `scare`"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -160,6 +186,8 @@ class Status:
     """None where a motion is shared, which tells it"""
     informed: bool = False
     """whether it has a wish where the fleet is to go"""
+    flees: bool = False
+    """whether it flees a threat that it sees"""
     lambda2: _Number | None = None
     """of the graph of those that heed each other, as it sees it"""
     graph_edge: _VehicleId | None = None
@@ -287,6 +315,20 @@ def decode_command(payload: bytes) -> Command:
     return command
 
 
+def _threat_fault(loc: tuple[int | str, ...], got: str) -> WireError:
+    allowed = {
+        "begins_ns": "a fleet time in ns",
+        **dict.fromkeys(("north_m", "east_m"), f"within {THREAT_PLACE_MAX_M:g} m of the fleet origin"),
+        **dict.fromkeys(("north_m_s", "east_m_s"), f"within {THREAT_SPEED_MAX_M_S:g} m/s"),
+        "radius_m": f"{THREAT_RADIUS_M[0]:g} to {THREAT_RADIUS_M[1]:g} m",
+        "lasts_s": f"{THREAT_LASTS_S[0]:g} to {THREAT_LASTS_S[1]:g} s",
+    }
+    key = str(loc[0]) if loc else ""
+    if key not in allowed:
+        return WireError("malformed", f"threat must be an object with {', '.join(allowed)}, got {got}")
+    return WireError("malformed", f"threat.{key} must be {allowed[key]}, got {got}")
+
+
 def _command_fault(loc: tuple[int | str, ...], fault: str, came: object) -> WireError:
     """What is wrong with a command, as pydantic found it first."""
     key = loc[0] if loc else ""
@@ -304,4 +346,6 @@ def _command_fault(loc: tuple[int | str, ...], fault: str, came: object) -> Wire
             )
         case "confirm":
             return WireError("malformed", f"confirm must be true or false, got {got}")
+        case "threat":
+            return _threat_fault(loc[1:], got)
     return WireError("malformed", "not a command: needs a JSON object with a verb")

@@ -30,7 +30,7 @@ Floats = npt.NDArray[np.float64]
 Record = dict[str, Any]
 """values that JSON can hold"""
 
-STUDIES = ("example1", "example2", "table3", "readings", "pareto", "worth", "faults", "scale", "theory")
+STUDIES = ("example1", "example2", "table3", "readings", "pareto", "worth", "faults", "evasion", "scale", "theory")
 FLOWN_STUDIES = ("headon", "messages", "campaign")
 """studies that fly the real agents in lockstep: minutes to hours, so `all` leaves them out"""
 FLYING_CODE = tuple(

@@ -13,7 +13,7 @@ from numba import config as numba_config
 from companion.config import law_tables
 from companion.core import estimate, values, vectors
 from companion.core import prediction as hold
-from companion.core.law import consensus, intent, paper
+from companion.core.law import consensus, evasion, intent, paper
 from companion.core.law import starling as law
 from companion.core.neighbours import gates
 from companion.core.safety import filter as safety
@@ -25,8 +25,8 @@ from sim.swarm.state import Floats
 F = TypeVar("F", bound=Callable[..., Any])
 
 _MODULES = (
-    baselines, consensus, error, estimate, gates, hold, intent, law, law_tables, near, paper, periodic, program, safety,
-    switching, values, vectors,
+    baselines, consensus, error, estimate, evasion, gates, hold, intent, law, law_tables, near, paper, periodic,
+    program, safety, switching, values, vectors,
 )  # fmt: skip
 
 
@@ -113,6 +113,11 @@ avoid: Callable[[float, float, float, float, Floats, int, int, float, Floats], s
 )
 is_outlier = compiled(gates.is_outlier)
 saturated = compiled(consensus.saturated)
+common_way = compiled(hold.common_way)
+away = compiled(evasion.away)
+share_fled = compiled(evasion.share_fled)
+evasive_wish = compiled(evasion.wish, away=away, share_fled=share_fled)
+evade = compiled(evasion.evade, away=away, wish=evasive_wish)
 common_velocity_rate = compiled(consensus.common_velocity_rate)
 anchor_rate = compiled(intent.anchor_rate, saturated=saturated)
 intent_rest = compiled(intent.rest, saturated=saturated)

@@ -10,11 +10,13 @@ from companion.core.law.intent import IntentGains, IntentTrigger
 from companion.core.prediction import Weights
 from companion.core.trigger.error import ErrorTrigger
 from companion.core.trigger.switching import SwitchingTrigger
+from companion.core.values import CommonMotion
 from sim.swarm.compiled import (
     anchor_axis,
     anchor_exceeds,
     axis,
     classic_threshold,
+    common_way,
     damped,
     elastic_threshold,
     exceeds,
@@ -94,7 +96,7 @@ def hold_weights(kind: int, tau: float, damping: float) -> Weights:
 def predict(
     out: Floats, sample: Floats, then: int, now: int, j: int, ref: Floats, slot: Floats, o: Options, ig: IntentGains
 ) -> None:
-    """p^, v^ and anchor of agent j at step `now` from its sample of step `then`, into out[0:6], out[9:12] of a row."""
+    """p^, v^ and anchor, or nu, of agent j at step `now` from its sample of step `then`, into out[0:6], out[9:12]."""
     tau = max((now - then) * o.dt, 0.0)
     m = j if ref.shape[1] > 1 else 0
     if o.intent == 1:
@@ -106,6 +108,14 @@ def predict(
             out[9 + k] = c
         return
     w = hold_weights(o.hold, tau, o.damping)
+    if o.flown_nu == 1:
+        level = common_way(CommonMotion(sample[6], sample[7], sample[9], sample[10]), tau)
+        upright = common_way(CommonMotion(sample[8], 0.0, sample[11], 0.0), tau)
+        out[9], out[10], out[11] = level.north_m_s, level.east_m_s, upright.north_m_s
+        out[0], out[3] = axis(sample[0], sample[3], 0.0, sample[6], level.north_m, out[9], w)
+        out[1], out[4] = axis(sample[1], sample[4], 0.0, sample[7], level.east_m, out[10], w)
+        out[2], out[5] = axis(sample[2], sample[5], 0.0, sample[8], upright.north_m, out[11], w)
+        return
     for k in range(3):
         if o.leaderless == 1:
             nu = sample[6 + k]
@@ -132,6 +142,7 @@ def compose(i: int, k: int, s: State, ref: Floats, o: Options) -> None:
             s.sent[i, c] = p
             s.sent[i, 3 + c] = v
             s.sent[i, 6 + c] = s.common[i, c]
+            s.sent[i, 9 + c] = s.common_rate[i, c]
     for c in range(FIELDS_MAX):
         s.sent[i, TOLD + c] = s.told[i, c]
     s.sent_step[i] = k
@@ -151,6 +162,13 @@ def fires(i: int, k: int, s: State, o: Options, et: ErrorTrigger, st: SwitchingT
     res = s.residual[i, 0] ** 2 + s.residual[i, 1] ** 2 + s.residual[i, 2] ** 2
     kind = o.trigger
     if kind == ERROR:
+        if o.flown_nu == 1:
+            nu = 0.0
+            for c in range(3):
+                a = s.common[i, c] - s.own[i, 9 + c]
+                nu += a * a
+            if nu >= et.epsilon_nu_m_s * et.epsilon_nu_m_s:
+                return True
         return exceeds(ep, ev, res, et)
     if kind == INTENT:
         ec = 0.0
@@ -366,9 +384,11 @@ def predict_all(k: int, s: State, ref: Floats, o: Options, ig: IntentGains) -> N
                 # what everyone predicts of j is what j's own trigger has just computed
                 for c in range(6):
                     s.predicted[j, c] = s.own[j, c]
-                if o.intent == 1:
-                    for c in range(3):
+                for c in range(3):
+                    if o.intent == 1:
                         s.predicted[j, 9 + c] = s.own[j, 6 + c]
+                    elif o.flown_nu == 1:
+                        s.predicted[j, 9 + c] = s.own[j, 9 + c]
             for c in range(3):
                 s.predicted[j, 6 + c] = s.slot[j, c]
             if j == o.fault_agent and k >= o.fault_step:

@@ -16,18 +16,21 @@ import math
 import numpy as np
 
 from companion.core.frames import Ned
+from companion.core.law.evasion import CALM, FLEES, Evasion, Threat
 from companion.core.law.intent import IntentGains, IntentTrigger
 from companion.core.law.starling import Gains, Sums
 from companion.core.trajectory.fleet import Reference
 from companion.core.trigger.error import ErrorTrigger
 from companion.core.trigger.switching import SwitchingTrigger
-from companion.core.values import VehicleState
+from companion.core.values import CommonMotion, VehicleState
 from sim.swarm.baselines import CUT
 from sim.swarm.compiled import (
     alpha_beta,
     anchor_rate,
     combine,
     common_velocity_rate,
+    common_way,
+    evade,
     inlined,
     intent_rest,
     is_outlier,
@@ -206,16 +209,45 @@ def reread(i: int, count: int, own: Floats, s: State, o: Options, g: Gains) -> t
 def agree(i: int, count: int, dt: float, s: State, o: Options) -> None:
     """One step of the estimate of the common velocity (`core.law.consensus`)."""
     n, x, y, z = 0.0, 0.0, 0.0, 0.0
+    c0, c1, c2 = s.common[i, 0], s.common[i, 1], s.common[i, 2]
+    if o.flown_nu == 1:
+        # The own one as the others predict it, as `vehicle.agreement` has it.
+        level = common_way(CommonMotion(c0, c1, s.common_rate[i, 0], s.common_rate[i, 1]), dt)
+        c0, c1 = level.north_m_s, level.east_m_s
     for q in range(count):
         if s.near[q, 9] > 0.0:
             e = s.near_row[q]
-            h = s.held[e] if o.links == 1 else s.sent[s.column[e]]
-            d0, d1, d2 = saturated(s.common[i, 0] - h[6], s.common[i, 1] - h[7], s.common[i, 2] - h[8], 1.0)
+            j = s.column[e]
+            h0, h1, h2 = s.sent[j, 6], s.sent[j, 7], s.sent[j, 8]
+            if o.flown_nu == 1:
+                r = e if o.links == 1 else j
+                h0, h1, h2 = s.predicted[r, 9], s.predicted[r, 10], s.predicted[r, 11]
+            elif o.links == 1:
+                h0, h1, h2 = s.held[e, 6], s.held[e, 7], s.held[e, 8]
+            d0, d1, d2 = saturated(c0 - h0, c1 - h1, c2 - h2, 1.0)
             n, x, y, z = n + 1.0, x + d0, y + d1, z + d2
     r0, r1, r2 = common_velocity_rate(n, x, y, z)
+    s.common_rate[i, 0], s.common_rate[i, 1], s.common_rate[i, 2] = r0, r1, r2
     s.common[i, 0] += dt * r0
     s.common[i, 1] += dt * r1
     s.common[i, 2] += dt * r2
+
+
+@inlined
+def shy(i: int, k: int, dt: float, ego: VehicleState, s: State, o: Options) -> int:
+    """One step of what agent i does about the threat (`core.law.evasion`), into its nu unless it is calm."""
+    row, t, p = s.evasion[i], s.threat, ego.position_ned_m
+    e = evade(
+        Evasion(int(row[0]), row[1], row[2], row[3], row[4], row[5], row[6], row[7]),
+        Threat(t[0], t[1], t[2], t[3], t[4], t[5]), k * o.dt - o.threat_begins, p.north, p.east, s.common[i, 0],
+        s.common[i, 1], dt,
+    )  # fmt: skip
+    row[0], row[1], row[2], row[3], row[4] = float(e.doing), e.north_m_s, e.east_m_s, e.north_m_s2, e.east_m_s2
+    row[5], row[6], row[7] = e.calm_north_m_s, e.calm_east_m_s, e.left_s
+    if e.doing != CALM:
+        s.common[i, 0], s.common[i, 1] = e.north_m_s, e.east_m_s
+        s.common_rate[i, 0], s.common_rate[i, 1], s.common_rate[i, 2] = e.north_m_s2, e.east_m_s2, 0.0
+    return e.doing
 
 
 @inlined
@@ -284,18 +316,25 @@ def command(k: int, s: State, ref: Floats, o: Options, g: Gains, ig: IntentGains
         common, asked = v_d, shared
         informed = s.informed[i] == 1
         if informed:
-            for c in range(3):
-                s.common[i, c] = s.wish[k, c]
+            if s.evasion[i, 0] == CALM:
+                for c in range(3):
+                    s.common[i, c] = s.wish[k, c]
+            s.evasion[i, 5], s.evasion[i, 6] = s.wish[k, 0], s.wish[k, 1]
             asked = Ned(s.wish[k, 3], s.wish[k, 4], s.wish[k, 5])
+        doing = CALM
         if o.leaderless == 1:
+            if o.threat_begins < math.inf:
+                doing = shy(i, k, dt, ego, s, o)
             common = Ned(s.common[i, 0], s.common[i, 1], s.common[i, 2])
+            if doing != CALM or (o.flown_nu == 1 and not informed):
+                asked = Ned(s.common_rate[i, 0], s.common_rate[i, 1], s.common_rate[i, 2])
         place = Ned(s.slot[i, 0], s.slot[i, 1], s.slot[i, 2])
-        if k < s.joined[i]:
-            # it flies along with the plan where it is
+        if k < s.joined[i] or doing == FLEES:
+            # it flies along with the plan where it is, or has no place
             place = ego.position_ned_m
         reference = Reference(place, common, asked, 0.0, True)
         count = look(i, k, own, common, s, ref, o)
-        sums = sums_over(ego, common, s.near, count, False, g)
+        sums = sums_over(ego, common, s.near, count, doing == FLEES, g)
         if o.separation_on_truth == 1 or o.separation_kind != CUT:
             x, y, z = reread(i, count, own, s, o, g)
             sums = Sums(
@@ -309,7 +348,7 @@ def command(k: int, s: State, ref: Floats, o: Options, g: Gains, ig: IntentGains
             u0, u1, u2 = combine(sums, ego, reference, g)
             residual = mean_residual(sums)
             s.residual[i, 0], s.residual[i, 1], s.residual[i, 2] = residual.north, residual.east, residual.down
-        if o.leaderless == 1 and not informed:
+        if o.leaderless == 1 and not informed and doing == CALM:
             agree(i, count, dt, s, o)
         keep_apart(i, count, u0, u1, u2, k, common, shared, s, o)
 
@@ -407,6 +446,10 @@ def exchange(
             for c in range(3):
                 s.record[k // keep_every, i, c] = s.x[i, c]
                 s.record[k // keep_every, i, 3 + c] = s.v[i, c]
+            if o.threat_begins < math.inf:
+                for c in range(3):
+                    s.record_common[k // keep_every, i, c] = s.common[i, c]
+                s.record_common[k // keep_every, i, 3] = s.evasion[i, 0]
     if k % o.every == 0:
         tick = k // o.every
         place_slots(k, s, ref)

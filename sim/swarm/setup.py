@@ -45,7 +45,7 @@ from sim.swarm.state import (
     Options,
 )
 
-DENSE_MAX = 200
+DENSE_MAX = 300
 """up to here every ordered pair may have its own row"""
 
 
@@ -130,12 +130,19 @@ class Setup:
     informed: tuple[int, ...] = ()
     """leaderless agents that know the motion (velocity, turn, legs) and fly by it; nobody passes it on"""
 
+    epsilon_nu_m_s: float = 0.0
+    """leaderless as flown: an estimate of the common velocity fires that is off by so much from what the peers make of
+    it, samples tell its rate, and the law is given it; 0: samples tell the estimate alone, when motion fires"""
+    threat: tuple[float, ...] = ()
+    """leaderless: begins (s), north, east (m from where the formation starts), velocity north, east (m/s), radius (m),
+    lasts (s) of what is fled (`core.law.evasion`); empty: nothing"""
+
     start_ball_m: float = 0.5
     """agents start anywhere in a ball of this radius about their slots"""
     start_velocity_m_s: float = 0.1
     """and with the plan's velocity plus up to this much on each axis"""
     start_separation_m: float = 0.0
-    """starts are drawn again until no two are closer than this (up to 200 agents)"""
+    """starts are drawn again until no two are closer than this (up to 300 agents)"""
     scrambled: bool = False
     """agents start at each other's slots, so that their paths cross"""
 
@@ -263,6 +270,9 @@ class Setup:
         agents = (*self.informed, *(d[0] for d in (*self.disturbances, *self.joins)))
         _check(all(a in range(n) for a in agents), "an agent", agents, f"one of 0..{n - 1}")
         _check(self.plan or not self.joins, "joins", self.joins, "empty without a plan, by which a joiner comes")
+        _check(len(self.threat) in (0, 7), "threat", self.threat, "seven numbers, or none")
+        _check(not (self.plan and self.threat), "threat", self.threat, "empty with a plan, which nobody leaves")
+        _check(self.epsilon_nu_m_s >= 0, "epsilon_nu_m_s", self.epsilon_nu_m_s, ">= 0")
         _check(not (self.plan and self.informed), "informed", self.informed, "empty with a plan, which all know")
         _check(0 <= self.nearest < n <= DENSE_MAX or not self.nearest, "nearest", self.nearest,
                f"less than the agents, {DENSE_MAX} at most")  # fmt: skip
@@ -492,6 +502,8 @@ def run_options(setup: Setup) -> Options:
         near_closest=max(setup.r0_m, setup.barrier_radius_m) + SPACING_MARGIN_M,
         near_radius=setup.barrier_radius_m,
         bound_m=setup.error_bound_m,
+        flown_nu=int(not setup.plan and setup.law == "flown" and setup.epsilon_nu_m_s > 0),
+        threat_begins=setup.threat[0] if setup.threat else math.inf,
         dense_measures=int(setup.dense_measures and setup.formation.count <= DENSE_MAX),
     )
 
@@ -504,7 +516,7 @@ def rules_of(setup: Setup) -> tuple[Gains, IntentGains, ErrorTrigger, SwitchingT
             setup.intent_k_p, setup.intent_k_d, setup.intent_c_g, setup.intent_c_max, setup.saturation_m,
             setup.saturation_m_s,
         ),
-        ErrorTrigger(setup.epsilon_m, setup.gamma_s2, setup.kappa),
+        ErrorTrigger(setup.epsilon_m, setup.gamma_s2, setup.kappa, setup.epsilon_nu_m_s),
         SwitchingTrigger(setup.gamma_s2, setup.alpha, setup.beta, setup.delta_min, setup.delta_f, setup.eta),
         IntentTrigger(setup.intent_epsilon_m, setup.intent_kappa),
     )  # fmt: skip

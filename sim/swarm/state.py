@@ -14,7 +14,7 @@ Flags = npt.NDArray[np.uint8]
 HOLD_ZERO, HOLD_FIRST, HOLD_DAMPED, HOLD_OBSERVER = 0, 1, 2, 3
 ERROR, SWITCHING, PERIODIC, FLOAT_CLOCK, CLASSIC, ELASTIC, INTENT = 0, 1, 2, 3, 4, 5, 6
 TOLD = 15
-"""floats of a sample's motion: flown law p, v, nu; published intent c, g, w, e, e'"""
+"""floats of a sample's motion: flown law p, v, nu, nu'; published intent c, g, w, e, e'"""
 SAMPLE = TOLD + FIELDS_MAX
 """floats of a sample: those, and what a law adds"""
 DIGEST_MAX = 16
@@ -104,6 +104,10 @@ class Options(NamedTuple):
     """the safety radius of a peer whose messages are not missing (m)"""
     bound_m: float
     """on the error of every prediction"""
+    flown_nu: int
+    """1: as flown, a leaderless sample tells nu's rate, nu's error fires, and the law is given the rate"""
+    threat_begins: float
+    """(s); infinite: nobody is scared"""
     dense_measures: int
     """1: minimum distance and prediction errors are measured at every step"""
 
@@ -128,6 +132,12 @@ class State(NamedTuple):
     """command of the last control period (N, 3)"""
     common: Floats
     """nu or w: estimate of the common velocity (N, 3)"""
+    common_rate: Floats
+    """nu' (N, 3)"""
+    evasion: Floats
+    """what each agent remembers of a threat, as `core.law.evasion.Evasion` (N, 8)"""
+    threat: Floats
+    """`core.law.evasion.Threat` (6,)"""
     anchor: Floats
     """c (N, 3)"""
     anchor_speed: Floats
@@ -141,7 +151,7 @@ class State(NamedTuple):
     clock: Floats
     """t_last of the float clock (N,)"""
     own: Floats
-    """what the peers predict of this agent (N, 6), and its anchor (N, 9)"""
+    """what the peers predict of this agent (N, 6), and its anchor, or nu, of which the law has one (N, 9)"""
     residual: Floats
     """mean residual of the last control period (N, 3)"""
     neighbours: Floats
@@ -151,7 +161,7 @@ class State(NamedTuple):
     observed: Floats
     """observer of the elastic baseline (N, 6)"""
     predicted: Floats
-    """rows (R, 12): p^, v^, slot's place, anchor"""
+    """rows (R, 12): p^, v^, slot's place, anchor or nu"""
     held: Floats
     """samples (R, SAMPLE)"""
     held_step: Ints
@@ -222,6 +232,8 @@ class State(NamedTuple):
     """[number of events, bytes' samples sent, mode steps dynamic, mode steps fixed, messages that reached somebody]"""
     record: Floats
     """(steps kept, N, 6)"""
+    record_common: Floats
+    """nu and what the agent does about a threat (steps kept, N, 4); no rows where nobody is scared"""
 
 
 ERROR_BIN_M = 0.001

@@ -2,7 +2,7 @@
 
 `Setup` says everything about a run; `run(setup, seed)` returns what happened. Every agent has its own random streams,
 drawn from seed and index alone: the same seed gives the same disturbances, noise and losses whatever the law does, so
-that laws are compared under equal luck. Up to 200 agents every ordered pair may be kept apart (loss, delay); above, a
+that laws are compared under equal luck. Up to 300 agents every ordered pair may be kept apart (loss, delay); above, a
 sorted list of the neighbours within range, with a skin of 1 m, is rebuilt when relative motion has used the skin up,
 and no array has N x N entries.
 """
@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from companion.core.law.base import FIELDS_MAX
+from companion.core.law.evasion import NO_THREAT, UNDISTURBED
 from companion.errors import ConfigError
 from companion.vehicle.publisher import CLOCK_SHIFT_NS
 from sim.swarm.neighbour_list import NeighbourList
@@ -62,6 +63,8 @@ class Run:
     """how many predictions were wrong by so many millimetres"""
     received: int = 0
     """how often a message reached a receiver, where receivers hold samples of their own"""
+    common: Floats = field(default_factory=lambda: np.zeros((0, 0, 4)))
+    """(T, N, 4): nu, and what each agent does about a threat (`core.law.evasion`); empty where nothing is fled"""
 
     def healthy(self) -> npt.NDArray[np.bool_]:
         """Agents that did not fail."""
@@ -223,7 +226,9 @@ def state_of(
         joined[int(agent)] = round(at_s / setup.dt_s)
     s = State(
         x=x, v=v, a=np.zeros((n, 3)), gust=np.zeros((n, 3)), bias=np.zeros((n, 3)), measured=np.zeros((n, 6)),
-        filtered=np.zeros((n, 6)), u=np.zeros((n, 3)), common=np.zeros((n, 3)), anchor=np.zeros((n, 3)),
+        filtered=np.zeros((n, 6)), u=np.zeros((n, 3)), common=np.zeros((n, 3)), common_rate=np.zeros((n, 3)),
+        evasion=np.zeros((n, len(UNDISTURBED))), threat=np.array(setup.threat[1:] or NO_THREAT, dtype=float),
+        anchor=np.zeros((n, 3)),
         anchor_speed=np.zeros((n, 3)), sent=np.zeros((n, SAMPLE)), sent_step=np.full(n, -1, dtype=np.int64),
         limit=np.zeros(n), clock=np.zeros(n), own=np.zeros((n, 12)), residual=np.zeros((n, 3)), neighbours=np.zeros(n),
         told=np.zeros((n, FIELDS_MAX)),
@@ -254,6 +259,7 @@ def state_of(
         ring_near=np.zeros((depth, talks, talks), dtype=np.uint8),
         events=np.zeros((n * (steps // setup.control_every + 1), 3), dtype=np.int64),
         counts=np.zeros(5, dtype=np.int64), record=np.zeros((kept, n, 6)),
+        record_common=np.zeros((kept if setup.threat else 0, n, 4)),
     )  # fmt: skip
     _start_estimates(s, setup, table, o)
     return s
@@ -313,6 +319,7 @@ def run(setup: Setup, seed: int, *, reference: Floats | None = None, start: tupl
         measures=dict(zip(MEASURES, map(float, s.measures), strict=True)),
         error_bins=s.error_bins,
         received=int(s.counts[4]),
+        common=s.record_common,
     )
 
 
@@ -326,6 +333,7 @@ def _start_estimates(s: Any, setup: Setup, table: Floats, o: Any) -> None:
         first = s.v[i] + setup.sigma_v_m_s * rng.normal(size=3)
         if not setup.plan:
             s.common[i] = first
+            s.evasion[i, 5:7] = first[:2]
     s.anchor[:] = s.x + s.bias - table[0, :, :3] - s.offset
     if not setup.count_start:
         # the paper: everyone knows everyone's start

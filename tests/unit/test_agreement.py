@@ -11,6 +11,8 @@ from hypothesis import strategies as st
 
 from companion.config import FleetConfig, load
 from companion.core.frames import Ned
+from companion.core.law.evasion import FLEE_SPEED_M_S, GO_BACK_S, Threat
+from companion.core.neighbours.gates import GATE_VELOCITY_M_S, outliers
 from companion.core.neighbours.sample import Foresight
 from companion.core.neighbours.table import PeerTable
 from companion.core.prediction import common_way
@@ -78,9 +80,9 @@ class One:
         """One control tick; returns the own slot."""
         now = at(seconds)
         plan = self.table.history.at(now.fleet_ns)
-        moment = self.agreement.advance(plan, plan.state_at(now.fleet_ns), self.heard, part, now)
-        self.heard = self.table.predict(self.position, now, moment, False)
         ego = VehicleState(now.fleet_ns, self.position, self.velocity)
+        moment = self.agreement.advance(plan, plan.state_at(now.fleet_ns), ego, self.heard, part, now)
+        self.heard = self.table.predict(self.position, now, moment, False)
         return self.agreement.place(plan, moment, ego, self.heard, part, now).slot(plan.slots[self.id]).position_ned_m
 
     def fly(self, seconds: float) -> None:
@@ -247,6 +249,113 @@ def test_the_slot_is_where_the_neighbours_are_wherever_the_shared_motion_began()
     assert one.agreement.centre.position_ned_m == pytest.approx(
         Ned(centre.north + away.north, centre.east + away.east, centre.down)
     )
+
+
+@pytest.mark.parametrize(
+    ("said", "gated"),
+    [
+        ((2.0, 0.0), frozenset()), ((2.0 - GATE_VELOCITY_M_S + 0.01, 0.0), frozenset()),
+        ((2.0 - GATE_VELOCITY_M_S - 0.01, 0.0), frozenset({4})), (None, frozenset({4})),
+    ],
+)  # fmt: skip
+def test_one_that_flies_as_it_says_is_no_outlier_however_the_others_fly(
+    said: tuple[float, float] | None, gated: frozenset[int]
+) -> None:
+    stands = [Neighbour(i, Ned(4.0 * i, 0.0, 0.0), ZERO, Ned(-4.0 * i, 0.0, 0.0), 0.0, True, True, 0.3) for i in (2, 3)]
+    flees = Neighbour(4, Ned(16.0, 0.0, 0.0), Ned(2.0, 0.0, 0.0), Ned(-16.0, 0.0, 0.0), 0.0, True, True, 0.3)
+    assert outliers([*stands, flees], ZERO, {2: (0.0, 0.0), 3: (0.0, 0.0), 4: said}) == gated
+    assert outliers([*stands, flees], ZERO) == {4}
+
+
+# -- what is fled ------------------------------------------------------------------------------------------------------
+
+
+def scared(threat: Threat, seconds: float, position: Ned | None = None, wish: Ned | None = None) -> One:
+    """One alone that stands where it is, and is told of a threat after the first tick."""
+    one = One(FREE, 1, free_motion(FREE))
+    one.position = position or one.position
+    one.tick(-STEP_S)
+    one.tick(0.0)
+    if wish is not None:
+        one.agreement.inform((VelocityLeg(wish, 0.0),), ns(-20.0))
+    one.agreement.scare(threat, ns(0.0))
+    for k in range(1, round(seconds / STEP_S) + 1):
+        one.tick(k * STEP_S)
+    return one
+
+
+def beside(one: Ned, lasts_s: float = 60.0, east_m: float = 3.0, radius_m: float = 10.0) -> Threat:
+    return Threat(one.north, one.east - east_m, 0.0, 0.0, radius_m, lasts_s)
+
+
+HOME = free_motion(FREE).reference(1, ns(0.0)).position_ned_m
+
+
+def test_who_flees_takes_that_for_nu_tells_it_and_has_its_place_where_it_is() -> None:
+    one = scared(beside(HOME), 5.0)
+    assert one.agreement.flees
+    assert one.velocity == pytest.approx(Ned(0.0, FLEE_SPEED_M_S, 0.0))
+    one.position = Ned(HOME.north + 7.0, HOME.east + 1.0, HOME.down)
+    slot = one.tick(5.0 + STEP_S)
+    assert (slot.north, slot.east) == pytest.approx((one.position.north, one.position.east))
+
+
+def test_what_it_says_of_the_centre_is_what_the_neighbours_say_while_it_flees() -> None:
+    one, other = One(FREE, 1, free_motion(FREE)), One(FREE, 2, free_motion(FREE))
+    for o in (one, other):
+        o.tick(-STEP_S)
+        o.tick(0.0)
+    one.table.accept(other.message(0.0), at(0.0))
+    one.agreement.scare(beside(HOME), ns(0.0))
+    one.position = one.position._replace(east=HOME.east + 2.0)
+    for k in range(1, 20):
+        one.tick(k * STEP_S)
+    assert one.agreement.flees
+    assert one.agreement.centre is not None
+    centre = free_motion(FREE).state_at(ns(2.0)).centre.position
+    assert one.agreement.centre.position_ned_m == pytest.approx(centre)
+
+
+def test_after_the_threat_it_wishes_what_all_had_and_is_then_uninformed() -> None:
+    one = scared(beside(HOME, lasts_s=3.0), 3.0 + 2.0)
+    assert not one.agreement.flees
+    assert one.velocity == pytest.approx(ZERO)
+    late, liar = scared(beside(HOME, lasts_s=3.0), 3.0 + GO_BACK_S + 1.0), One(FREE, 2, free_motion(FREE))
+    said = CommonMotion(0.5, 0.0, 0.0, 0.0)
+    late.table.accept(liar.message(9.0, common=said), at(9.0))
+    for k in range(91, 100):
+        late.tick(k * STEP_S)
+    assert late.velocity.north > 0.2
+
+
+def test_who_is_informed_flees_too_and_goes_back_to_its_wish() -> None:
+    wish = Ned(0.0, -1.0, 0.0)
+    assert scared(beside(HOME), 5.0, wish=wish).velocity.east == pytest.approx(FLEE_SPEED_M_S)
+    assert scared(beside(HOME, lasts_s=3.0), 6.0, wish=wish).velocity == pytest.approx(wish)
+    assert scared(beside(HOME, lasts_s=3.0), 20.0, wish=wish).velocity == pytest.approx(wish)
+
+
+def test_a_threat_at_the_fence_chases_nobody_out() -> None:
+    fence = FREE.geofence
+    assert fence is not None
+    edge = Ned(0.0, 197.5, HOME.down)
+    one = scared(Threat(0.0, 194.0, 0.0, 0.0, 20.0, 60.0), 5.0, edge)
+    assert one.agreement.flees
+    assert one.velocity.east <= 0.5 * fence.edge_room_m(edge.north, edge.east) + 1e-9
+
+
+def test_who_is_not_in_formation_flees_nothing_and_a_shared_motion_ends_a_threat() -> None:
+    one = scared(beside(HOME), 2.0)
+    one.tick(2.0 + STEP_S, part=False)
+    assert not one.agreement.flees
+    one = scared(beside(HOME), 2.0)
+    shared = with_legs(
+        going_on(one.motion, ns(2.0), ZERO, ZERO), at_ns=ns(2.1), issuer=0, legs=(VelocityLeg(ZERO, 0.0),)
+    )
+    assert one.table.history.adopt(shared)
+    one.tick(2.2)
+    assert not one.agreement.flees
+    assert one.agreement.told is None
 
 
 # -- prediction --------------------------------------------------------------------------------------------------------

@@ -26,7 +26,7 @@ from companion.operator.client import (
     velocity_leg,
 )
 from companion.operator.clocks import ROUNDS_LEAST
-from companion.wire.operator import PLACES_MAX, Check, PreflightReport, decode_command, encode
+from companion.wire.operator import PLACES_MAX, Check, PreflightReport, Scare, decode_command, encode
 from companion.wire.peer import decode_motion, encode_motion
 
 CONFIG = load(Path(__file__).resolve().parents[2] / "fleet.toml", lambda t: t.update(vehicle=t["vehicle"][:4]))
@@ -267,6 +267,26 @@ def test_a_wish_is_told_to_those_named_alone() -> None:
     assert sorted(told) == [1, 3]
     assert told[1]["verb"] == "wish"
     assert told[1]["leg"] == {"kind": "velocity", "velocity_ned_m_s": [1.0, 0.0, 0.0], "duration_s": 0.0}
+
+
+THREAT = Scare(begins_ns=NOW_NS, north_m=-20.0, east_m=0.0, north_m_s=5.0, radius_m=8.0, lasts_s=10.0)
+
+
+def test_all_are_told_of_a_threat_where_no_motion_is_shared() -> None:
+    link = drifting()
+    assert Operator(CONFIG, link).scare(THREAT, NOW_NS).accepted == (1, 2, 3, 4)
+    told = {i: decode_command(payload) for i, kind, payload in link.came if kind == "command"}
+    assert {i: c.threat for i, c in told.items()} == dict.fromkeys(range(1, 5), THREAT)
+
+
+def test_nobody_is_told_of_a_threat_where_a_motion_is_shared_or_nobody_answers() -> None:
+    link = fleet()
+    with pytest.raises(RefusedError, match="only a free one flees: move --free first"):
+        Operator(CONFIG, link).scare(THREAT, NOW_NS)
+    assert not [kind for _, kind, _ in link.came if kind == "command"]
+    link.motions = dict.fromkeys(link.motions, None)
+    with pytest.raises(RefusedError, match="no vehicle answers"):
+        Operator(CONFIG, link).scare(THREAT, NOW_NS)
 
 
 def test_goto_flies_the_centre_to_the_point_and_stops_there() -> None:

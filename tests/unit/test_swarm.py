@@ -232,15 +232,15 @@ def test_neighbour_list_holds_everyone_within_range_until_relative_motion_uses_u
     assert near.update(x + rng.uniform(-2, 2, x.shape))
 
 
-def test_above_200_agents_no_array_is_square_and_the_swarm_still_forms() -> None:
+def test_above_300_agents_no_array_is_square_and_the_swarm_still_forms() -> None:
     large = Setup(
-        formation=Formation(shape="cloud", count=250, spacing_m=3.0), range_m=7.6, duration_s=4.0, dt_s=0.02,
+        formation=Formation(shape="cloud", count=343, spacing_m=3.0), range_m=7.6, duration_s=4.0, dt_s=0.02,
         dense_measures=False,
     )  # fmt: skip
     flown = run(large, 0)
     error = np.sqrt((flown.formation_error_m() ** 2).mean(axis=1))
     assert error[-1] < 0.3 * error[0]
-    with pytest.raises(ConfigError, match="200"):
+    with pytest.raises(ConfigError, match="300"):
         replace(large, loss=0.1)
 
 

@@ -8,6 +8,7 @@ import pytest
 pytest.importorskip("numba")
 
 from companion.core.frames import Ned
+from companion.core.law import evasion
 from companion.core.safety import filter as safety
 from companion.core.trigger import near
 from companion.core.values import Neighbour
@@ -153,6 +154,53 @@ def test_a_share_of_the_errors_is_read_from_their_bins() -> None:
     assert quantile_m(bins, 0.9999) == pytest.approx(0.501)
 
 
+FREE = replace(
+    FOUR, formation=Formation(shape="grid", count=9, spacing_m=4.0), plan=False, k_p=0.0, nearest=3, links=False,
+    epsilon_nu_m_s=0.03, barrier=True, r0_m=2.0, duration_s=30.0, start_ball_m=0.1, start_velocity_m_s=0.0,
+)  # fmt: skip
+SCARED = replace(FREE, threat=(4.0, 4.0, -9.0, 0.0, 0.0, 8.0, 3.0))
+"""it stands beside the formation, north of where that is by then"""
+
+
+def test_who_sees_the_threat_flees_it_the_others_follow_and_in_the_end_all_fly_as_before() -> None:
+    calm, flown = run(FREE, 1), run(SCARED, 1)
+    fled = (flown.common[:, :, 3] == evasion.FLEES).any(axis=0)
+    assert 1 <= fled.sum() <= 6
+    assert not calm.common.size
+    before = flown.time_s <= 4.0
+    assert np.array_equal(flown.position_m[before], calm.position_m[before])
+    nu = flown.common[:, :, :2]
+    moved = np.linalg.norm(nu - nu[0], axis=2).max(axis=0)
+    assert moved[fled].min() > 0.5
+    assert moved[~fled].max() > 0.1
+    assert np.linalg.norm(nu[-1] - [1.0, 0.0], axis=1).max() < 0.1
+    assert flown.measures["minimum_distance_m"] > 1.5
+    assert flown.formation_error_m()[-1].max() < 0.5
+
+
+def test_without_messages_nobody_but_those_that_see_the_threat_moves() -> None:
+    deaf = run(replace(SCARED, loss=1.0), 1)
+    fled = (deaf.common[:, :, 3] == evasion.FLEES).any(axis=0)
+    assert fled.any()
+    assert np.abs(deaf.common[:, ~fled, 1]).max() < 1e-9
+
+
+def test_an_informed_one_flees_and_goes_back_to_what_it_knows() -> None:
+    led = run(replace(SCARED, informed=(0, 1, 2, 3, 4, 5, 6, 7, 8)), 1)
+    fled = (led.common[:, :, 3] == evasion.FLEES).any(axis=0)
+    assert np.linalg.norm(led.common[:, fled, :2] - [1.0, 0.0], axis=2).max() > 0.5
+    assert led.common[-1, :, :2] == pytest.approx(np.tile([1.0, 0.0], (9, 1)))
+
+
+def test_the_evasion_that_is_compiled_is_the_flown_one() -> None:
+    rng = np.random.default_rng(5)
+    for _ in range(500):
+        e = evasion.Evasion(int(rng.integers(3)), *rng.normal(size=6).tolist(), float(rng.uniform(0.0, 5.0)))
+        threat = evasion.Threat(*rng.normal(scale=5.0, size=4).tolist(), float(rng.uniform(1.0, 20.0)), 10.0)
+        at = (float(rng.uniform(-1.0, 11.0)), *rng.normal(scale=8.0, size=2).tolist(), *rng.normal(size=2).tolist())
+        assert core.evade(e, threat, *at, 0.02) == pytest.approx(evasion.evade(e, threat, *at, 0.02))
+
+
 @pytest.mark.parametrize(
     ("values", "says"),
     [
@@ -163,6 +211,9 @@ def test_a_share_of_the_errors_is_read_from_their_bins() -> None:
         ({"plan": False, "joins": [[1, 2.0, 0.0, 0.0, 0.0]]}, "joins must be empty without a plan"),
         ({"disturbances": [[1.0, 2.0]]}, "disturbances must be rows of 7 numbers"),
         ({"nearest": 10}, "nearest must be less than the agents"),
+        ({"threat": [1.0, 0.0, 0.0, 0.0, 0.0, 5.0, 3.0]}, "threat must be empty with a plan"),
+        ({"plan": False, "threat": [1.0, 0.0, 0.0]}, "threat must be seven numbers"),
+        ({"epsilon_nu_m_s": -0.1}, "epsilon_nu_m_s must be >= 0"),
     ],
 )
 def test_a_scene_that_cannot_be_flown_is_refused_with_a_sentence(values: dict[str, object], says: str) -> None:

@@ -15,7 +15,7 @@ from companion.io.transport import TransportError
 
 VERBS = {
     "init",
-    "status", "preflight", "takeoff", "land", "rtl", "hold", "form", "move", "release", "resume", "kill",
+    "status", "preflight", "takeoff", "land", "rtl", "hold", "form", "move", "scare", "release", "resume", "kill",
 }  # fmt: skip
 HEAVY = ("zenoh", "pymavlink", "scipy", "shapely", "mcap", "companion.config", "companion.io", "sim.launch")
 FLEET_TOML = str(Path(__file__).resolve().parents[2] / "fleet.toml")
@@ -65,6 +65,12 @@ def test_each_verb_has_a_help_of_its_own(verb: str) -> None:
         (["move", "--turn", "0", "90"], "the rate must not be 0 deg/s, got 0; to stop the formation, use hold"),
         (["move", "--turn", "6", "90", "--altitude", "12"], "--altitude belongs to --goto, got it with --turn"),
         (["move", "--vehicle", "3", "--goto", "1", "2"], "move --goto is for all"),
+        (["scare", "--at", "1e5", "0"], "scare --at: each number must be within 10000 m, got 100000 0"),
+        (["scare", "--at", "0", "nan"], "scare --at: each number must be within 10000 m, got 0 nan"),
+        (
+            ["scare", "--at", "0", "0", "--velocity", "0", "31"],
+            "scare --velocity: each number must be within 30 m/s, got 0 31",
+        ),
         (["land", "--fleet", "nowhere.toml"], "nowhere.toml: cannot be read"),
     ],
 )

@@ -106,6 +106,11 @@ def test_a_killed_vehicle_is_shown_as_killed_whatever_its_phase_and_before_all_o
     assert "and 7 more" in crowded[-1]
 
 
+def test_one_that_flees_is_told_as_that_before_its_failsafes() -> None:
+    lines = shown({1: status(flees=True, failsafes=["battery low"]), 2: status()}, 200)
+    assert ["flees; battery low" in line for line in lines if line.split()[:1] in (["1"], ["2"])] == [True, False]
+
+
 def test_the_summary_shows_who_commanded_what_and_who_was_killed(capsys: pytest.CaptureFixture[str]) -> None:
     none = {"p50": None, "p99": None}
     steady = dict.fromkeys(

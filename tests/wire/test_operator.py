@@ -20,6 +20,7 @@ from companion.wire.operator import (
     ClockReading,
     Command,
     Place,
+    Scare,
     as_json,
     decode,
     decode_command,
@@ -27,6 +28,7 @@ from companion.wire.operator import (
 )
 
 COMMAND = Command(verb="land", id="9f2c", issuer="operator-1b", after={1: (Place(7, 1, 4),), 2: ()})
+SCARE = Scare(begins_ns=5, north_m=-40.0, east_m=2.5, north_m_s=6.0, east_m_s=0.0, radius_m=10.0, lasts_s=15.0)
 ANSWER = Answer(vehicle=3, accepted=False, reason="it is on the ground", place=Place(7, 1, 4), revision=2)
 places = st.builds(Place, *[st.integers(0, 2**63 - 1)] * 3)
 names = st.text(st.characters(exclude_categories=("Cs",)), min_size=1, max_size=64)
@@ -38,6 +40,11 @@ names = st.text(st.characters(exclude_categories=("Cs",)), min_size=1, max_size=
 )  # fmt: skip
 def test_a_command_survives_its_journey(verb: Any, own_id: str, issuer: str, after: Any, confirm: bool) -> None:
     command = Command(verb=verb, id=own_id, issuer=issuer, after=after, confirm=confirm)
+    assert decode_command(encode(command)) == command
+
+
+def test_what_is_fled_survives_its_journey() -> None:
+    command = replace(COMMAND, verb="scare", threat=SCARE)
     assert decode_command(encode(command)) == command
 
 
@@ -61,6 +68,10 @@ def changed(**fields: object) -> bytes:
     return json.dumps({k: v for k, v in plain.items() if v != "left out"}).encode()
 
 
+def threat(**fields: object) -> bytes:
+    return changed(verb="scare", threat={**as_json(replace(COMMAND, threat=SCARE))["threat"], **fields})
+
+
 WRONG: list[tuple[bytes, str, str]] = [
     (b"", "malformed", "needs a JSON object with a verb"),
     (b"[]", "malformed", "needs a JSON object with a verb"),
@@ -68,7 +79,7 @@ WRONG: list[tuple[bytes, str, str]] = [
     (changed(verb="left out"), "malformed", "needs a JSON object with a verb"),
     (
         changed(verb="fly"), "unknown verb",
-        "unknown verb 'fly'; known: takeoff, land, motion, wish, release, resume, kill",
+        "unknown verb 'fly'; known: takeoff, land, motion, wish, scare, release, resume, kill",
     ),
     (changed(verb=3), "unknown verb", "unknown verb 3;"),
     (changed(id=""), "id", "id must be a text of up to 64 characters, got ''"),
@@ -84,6 +95,16 @@ WRONG: list[tuple[bytes, str, str]] = [
     (changed(after={"251": []}), "places", "after must be"),
     (changed(after={"1": [[7, 1, 4]] * (PLACES_MAX + 1)}), "places", f"with up to {PLACES_MAX} of"),
     (changed(confirm=1), "malformed", "confirm must be true or false, got 1"),
+    (threat(radius_m=0.99), "malformed", "threat.radius_m must be 1 to 50 m, got 0.99"),
+    (threat(radius_m=50.01), "malformed", "threat.radius_m must be 1 to 50 m, got 50.01"),
+    (threat(lasts_s=0.0), "malformed", "threat.lasts_s must be 0.5 to 60 s, got 0.0"),
+    (threat(lasts_s=61.0), "malformed", "threat.lasts_s must be 0.5 to 60 s, got 61.0"),
+    (threat(north_m=1.1e4), "malformed", "threat.north_m must be within 10000 m of the fleet origin, got 11000.0"),
+    (threat(east_m_s=-31.0), "malformed", "threat.east_m_s must be within 30 m/s, got -31.0"),
+    (threat(north_m_s=float("nan")), "malformed", "threat.north_m_s must be within 30 m/s, got nan"),
+    (threat(east_m="2"), "malformed", "threat.east_m must be within 10000 m"),
+    (threat(begins_ns=-1), "malformed", "threat.begins_ns must be a fleet time in ns, got -1"),
+    (changed(threat=3), "malformed", "threat must be an object with begins_ns, north_m"),
     (changed(motion=" " * COMMAND_BYTES_MAX), "malformed", f"may have {COMMAND_BYTES_MAX}"),
 ]  # fmt: skip
 

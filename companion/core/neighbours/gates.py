@@ -1,6 +1,6 @@
 """The gates of a settled formation: a peer whose prediction is far from what the others' say does not draw it."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from statistics import median
 
 from companion.core.frames import Ned
@@ -20,10 +20,13 @@ def is_outlier(velocity_north: float, velocity_east: float, residual_north: floa
     )
 
 
-def outliers(neighbours: Sequence[Neighbour], ego: Ned, *, free: bool = False) -> frozenset[int]:
+def outliers(
+    neighbours: Sequence[Neighbour], ego: Ned, said: Mapping[int, tuple[float, float] | None] | None = None
+) -> frozenset[int]:
     """Ids of those in formation whose prediction is far from what the others' say.
 
-    Where no motion is shared (`free`), velocities are compared with their median: the vehicles are still to agree.
+    Where no motion is shared, `said` is what each takes for the common velocity (north, east, m/s), and its own is
+    compared with that: the vehicles are still to agree, and one that flees, or knows where to go, flies as it says.
     """
     residuals = []
     for n in neighbours:
@@ -33,14 +36,10 @@ def outliers(neighbours: Sequence[Neighbour], ego: Ned, *, free: bool = False) -
     if not residuals:
         return frozenset()
     middle_north, middle_east = median(r[1] for r in residuals), median(r[2] for r in residuals)
-    slow_north = slow_east = 0.0
-    if free:
-        slow_north = median(n.velocity_ned_m_s.north - n.reference_velocity_ned_m_s.north for n, _, _ in residuals)
-        slow_east = median(n.velocity_ned_m_s.east - n.reference_velocity_ned_m_s.east for n, _, _ in residuals)
     gated = []
     for n, north, east in residuals:
         v, slot = n.velocity_ned_m_s, n.reference_velocity_ned_m_s
-        v_north, v_east = v.north - slot.north - slow_north, v.east - slot.east - slow_east
-        if is_outlier(v_north, v_east, north - middle_north, east - middle_east):
+        due_north, due_east = (said and said[n.vehicle_id]) or (slot.north, slot.east)
+        if is_outlier(v.north - due_north, v.east - due_east, north - middle_north, east - middle_east):
             gated.append(n.vehicle_id)
     return frozenset(gated)

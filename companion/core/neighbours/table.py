@@ -343,7 +343,8 @@ class PeerTable:
             return neighbours
         if now.monotonic_ns >= self._gated_until_ns:
             self._gated_until_ns = now.monotonic_ns + GATE_PERIOD_NS
-            self._gated = outliers(neighbours, ego_ned_m, free=free)
+            said = {n.vehicle_id: self.common_velocity_m_s(n.vehicle_id, now) for n in neighbours} if free else None
+            self._gated = outliers(neighbours, ego_ned_m, said)
         if not self._gated:
             return neighbours
         return [n._replace(in_formation=False) if n.vehicle_id in self._gated else n for n in neighbours]
