@@ -279,8 +279,8 @@ def _figures(config: Config, piece: Record, seed: int, judged: Judged) -> list[F
         x, x / STARLINGS_M_S[1], x / STARLINGS_M_S[0], color=GREY, alpha=0.4, lw=0,
         label=f"starlings: {STARLINGS_M_S[0]:g}–{STARLINGS_M_S[1]:g} m/s",
     )  # fmt: skip
-    ax.set(xlabel="distance from the nearest that has fled (m)", ylabel="delay (s)", title=cases[0], ylim=(0, 8))
-    ax.legend(loc="upper left", fontsize=7)
+    ax.set(xlabel="distance from the nearest that has fled (m)", ylabel="delay (s)", title=cases[0], ylim=(0, 12))
+    ax.legend(loc="upper right", fontsize=7, frameon=True, edgecolor="none")
     ax = axes[0, 1]
     for (colour, _), (name, r) in zip(FAMILY, piece[cases[0]].items(), strict=False):
         ax.plot(r["time_s"], 100.0 * np.array(r["local"]), color=colour, label=f"{name}, of its neighbours' place")
