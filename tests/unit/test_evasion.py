@@ -39,7 +39,7 @@ def test_the_wish_is_finite_and_changes_no_faster_than_it_may(
     e = evade(Evasion(doing, 0.0, 0.0, 0.0, 0.0, c_n, c_e, 2.0), threat, since_s, north, east, nu_n, nu_e, dt_s)
     assert all(isfinite(x) for x in e)
     assert hypot(e.north_m_s - nu_n, e.east_m_s - nu_e) <= evasion.FLEE_RATE_M_S2 * dt_s + 1e-9
-    assert hypot(e.north_m_s2, e.east_m_s2) <= evasion.FLEE_RATE_M_S2 * (1.0 + 1e-6)
+    assert hypot(e.north_m_s2, e.east_m_s2) <= evasion.TOLD_RATE_M_S2 * (1.0 + 1e-6)
 
 
 @given(threats, st.floats(0.0, 60.0), places, places, calm, calm)

@@ -31,6 +31,9 @@ FLEE_SPEED_M_S = 2.0
 """V"""
 FLEE_RATE_M_S2 = 3.0
 """the wish changes no faster than this"""
+TOLD_RATE_M_S2 = 1.0
+"""as much of that is told and flown ahead of: peers carry a rate on for 2 s (`core.prediction`), and what they reckon
+with is no more than the speed to flee with, where the next message is lost"""
 GO_BACK_S = 5.0
 """for so long the common velocity of before is wished"""
 MEMORY_S = 60.0
@@ -59,7 +62,7 @@ class Evasion(NamedTuple):
     """the wish; of no meaning while calm"""
     east_m_s: float
     north_m_s2: float
-    """its rate"""
+    """its rate, within TOLD_RATE_M_S2"""
     east_m_s2: float
     calm_north_m_s: float
     """c"""
@@ -139,6 +142,7 @@ def evade(
     allowed = min(1.0, FLEE_RATE_M_S2 * dt_s / max(hypot(step_north, step_east), 1e-12))
     step_north, step_east = allowed * step_north, allowed * step_east
     per_s = 1.0 / max(dt_s, 1e-6)
+    per_s *= min(1.0, TOLD_RATE_M_S2 / max(per_s * hypot(step_north, step_east), 1e-12))
     return Evasion(
         doing, common_north + step_north, common_east + step_east, per_s * step_north, per_s * step_east, calm_north,
         calm_east, left_s,
