@@ -12,7 +12,13 @@ import pytest
 
 FLEETS = ("test_fleet_up.py", "test_missing.py")
 """files of tests/process that fly whole fleets: half of the time of all"""
-TOGETHER = ("test_flight.py", "test_faults.py", "test_damaged_recordings.py", "test_leaderless.py")
+TOGETHER = (
+    "test_flight.py",
+    "test_faults.py",
+    "test_damaged_recordings.py",
+    "test_intent_flight.py",
+    "test_leaderless.py",
+)
 """files of tests/lockstep whose tests look at flights that they share"""
 COMPILED = (
     "test_evasion_study.py",
