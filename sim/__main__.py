@@ -15,6 +15,7 @@ from companion.operator import verbs
 from companion.operator.verbs import FAILED, FLEET_TOML, FleetFile, Vehicles
 from companion.terminal import tell, tolerate_any_encoding
 from sim.autopilot.faults import Fault, FaultKind
+from sim.study import FLOWN_STUDIES, STUDIES
 
 app = typer.Typer(
     no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
@@ -208,10 +209,7 @@ def sitl(
 def study(
     name: Annotated[
         str,
-        typer.Argument(
-            help="example1, example2, table3, readings, pareto, faults, scale, theory, all; "
-            "or headon, messages, campaign."
-        ),
+        typer.Argument(help=f"{', '.join(STUDIES)}, all; or {', '.join(FLOWN_STUDIES)}."),
     ],
     seeds: Annotated[
         str | None, typer.Option(help="As in 0..19 (the default) or 0,3,5; without it, all takes 20..39.")
@@ -222,7 +220,7 @@ def study(
 ) -> None:
     """Reproduce the paper's results and compare ours: tables, figures, a report. Finished seeds are not run again.
 
-    Needs the extra: pip install 'starling-fleet[study]'.
+    Needs the extra `study` of starling-fleet.
     """
     from sim.study.run import study as run
 

@@ -23,6 +23,7 @@ from scipy.stats import beta
 from companion.config.law_tables import LAWS
 from companion.config.registry import Origin
 from companion.errors import ConfigError
+from sim.study import FLOWN_STUDIES, STUDIES
 from sim.swarm.setup import Setup, connected, setup_from
 from sim.swarm.swarm import Run, kernels
 
@@ -30,9 +31,6 @@ Floats = npt.NDArray[np.float64]
 Record = dict[str, Any]
 """values that JSON can hold"""
 
-STUDIES = ("example1", "example2", "table3", "readings", "pareto", "worth", "faults", "evasion", "scale", "theory")
-FLOWN_STUDIES = ("headon", "messages", "campaign")
-"""studies that fly the real agents in lockstep: minutes to hours, so `all` leaves them out"""
 FLYING_CODE = tuple(
     sorted(p for folder in ("companion", "sim") for p in (Path(__file__).parents[2] / folder).rglob("*.py"))
 )

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from sim.study.common import FLOWN_STUDIES, Config, Outcome, Table, study_module
+from sim.study import FLOWN_STUDIES
+from sim.study.common import Config, Outcome, Table, study_module
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222; }

@@ -6,9 +6,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from companion.errors import CompanionError, ConfigError
+from sim.study import FLOWN_STUDIES, STUDIES
 from sim.study.common import (
-    FLOWN_STUDIES,
-    STUDIES,
     Config,
     Outcome,
     load_config,
