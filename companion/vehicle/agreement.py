@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 from companion.config import FleetConfig
 from companion.core.frames import Ned
-from companion.core.law.consensus import common_velocity_rate, saturated
+from companion.core.law.consensus import STEP_MAX_S, common_velocity_rate, saturated
 from companion.core.law.evasion import CALM, FLEES, NO_THREAT, UNDISTURBED, Threat, evade
 from companion.core.neighbours.table import PeerTable
 from companion.core.prediction import common_way
@@ -30,10 +30,6 @@ SATURATION_M_S = 1.0
 """norm at which a difference of two estimates saturates"""
 WALL_RATE_PER_S = 0.5
 """a common motion toward the fence's edge is no faster than the room left to the slot, times this"""
-
-
-STEP_MAX_S = 0.2
-"""a vehicle whose positions were gone for longer goes on from what it had"""
 
 
 class Centre(NamedTuple):

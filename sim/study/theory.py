@@ -94,7 +94,7 @@ RARE = 1e-7
 
 def heartbeats_only(setup: Setup) -> Setup:
     """The same vehicles without a trigger: they speak every T_max."""
-    return replace(setup, epsilon_m=1e3, kappa=0.0)
+    return replace(setup, epsilon_m=1e3, epsilon_nu_m_s=1e3, kappa=0.0)
 
 
 def ultimate_bound(s: Setup) -> Record:

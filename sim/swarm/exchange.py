@@ -108,7 +108,7 @@ def predict(
             out[9 + k] = c
         return
     w = hold_weights(o.hold, tau, o.damping)
-    if o.flown_nu == 1:
+    if o.leaderless == 1:
         level = common_way(CommonMotion(sample[6], sample[7], sample[9], sample[10]), tau)
         upright = common_way(CommonMotion(sample[8], 0.0, sample[11], 0.0), tau)
         out[9], out[10], out[11] = level.north_m_s, level.east_m_s, upright.north_m_s
@@ -117,13 +117,9 @@ def predict(
         out[2], out[5] = axis(sample[2], sample[5], 0.0, sample[8], upright.north_m, out[11], w)
         return
     for k in range(3):
-        if o.leaderless == 1:
-            nu = sample[6 + k]
-            out[k], out[3 + k] = axis(sample[k], sample[3 + k], 0.0, nu, nu * tau, nu, w)
-        else:
-            out[k], out[3 + k] = axis(
-                sample[k], sample[3 + k], ref[then, m, k], ref[then, m, 3 + k], ref[now, m, k], ref[now, m, 3 + k], w
-            )
+        out[k], out[3 + k] = axis(
+            sample[k], sample[3 + k], ref[then, m, k], ref[then, m, 3 + k], ref[now, m, k], ref[now, m, 3 + k], w
+        )
 
 
 @inlined
@@ -162,7 +158,7 @@ def fires(i: int, k: int, s: State, o: Options, et: ErrorTrigger, st: SwitchingT
     res = s.residual[i, 0] ** 2 + s.residual[i, 1] ** 2 + s.residual[i, 2] ** 2
     kind = o.trigger
     if kind == ERROR:
-        if o.flown_nu == 1:
+        if o.leaderless == 1 and o.intent == 0:
             nu = 0.0
             for c in range(3):
                 a = s.common[i, c] - s.own[i, 9 + c]
@@ -387,7 +383,7 @@ def predict_all(k: int, s: State, ref: Floats, o: Options, ig: IntentGains) -> N
                 for c in range(3):
                     if o.intent == 1:
                         s.predicted[j, 9 + c] = s.own[j, 6 + c]
-                    elif o.flown_nu == 1:
+                    elif o.leaderless == 1:
                         s.predicted[j, 9 + c] = s.own[j, 9 + c]
             for c in range(3):
                 s.predicted[j, 6 + c] = s.slot[j, c]

@@ -210,7 +210,7 @@ def agree(i: int, count: int, dt: float, s: State, o: Options) -> None:
     """One step of the estimate of the common velocity (`core.law.consensus`)."""
     n, x, y, z = 0.0, 0.0, 0.0, 0.0
     c0, c1, c2 = s.common[i, 0], s.common[i, 1], s.common[i, 2]
-    if o.flown_nu == 1:
+    if o.intent == 0:
         # The own one as the others predict it, as `vehicle.agreement` has it.
         level = common_way(CommonMotion(c0, c1, s.common_rate[i, 0], s.common_rate[i, 1]), dt)
         c0, c1 = level.north_m_s, level.east_m_s
@@ -218,12 +218,13 @@ def agree(i: int, count: int, dt: float, s: State, o: Options) -> None:
         if s.near[q, 9] > 0.0:
             e = s.near_row[q]
             j = s.column[e]
-            h0, h1, h2 = s.sent[j, 6], s.sent[j, 7], s.sent[j, 8]
-            if o.flown_nu == 1:
+            if o.intent == 0:
                 r = e if o.links == 1 else j
                 h0, h1, h2 = s.predicted[r, 9], s.predicted[r, 10], s.predicted[r, 11]
             elif o.links == 1:
                 h0, h1, h2 = s.held[e, 6], s.held[e, 7], s.held[e, 8]
+            else:
+                h0, h1, h2 = s.sent[j, 6], s.sent[j, 7], s.sent[j, 8]
             d0, d1, d2 = saturated(c0 - h0, c1 - h1, c2 - h2, 1.0)
             n, x, y, z = n + 1.0, x + d0, y + d1, z + d2
     r0, r1, r2 = common_velocity_rate(n, x, y, z)
@@ -326,7 +327,7 @@ def command(k: int, s: State, ref: Floats, o: Options, g: Gains, ig: IntentGains
             if o.threat_begins < math.inf:
                 doing = shy(i, k, dt, ego, s, o)
             common = Ned(s.common[i, 0], s.common[i, 1], s.common[i, 2])
-            if doing != CALM or (o.flown_nu == 1 and not informed):
+            if doing != CALM or (o.intent == 0 and not informed):
                 asked = Ned(s.common_rate[i, 0], s.common_rate[i, 1], s.common_rate[i, 2])
         place = Ned(s.slot[i, 0], s.slot[i, 1], s.slot[i, 2])
         if k < s.joined[i] or doing == FLEES:

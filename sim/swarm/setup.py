@@ -130,9 +130,8 @@ class Setup:
     informed: tuple[int, ...] = ()
     """leaderless agents that know the motion (velocity, turn, legs) and fly by it; nobody passes it on"""
 
-    epsilon_nu_m_s: float = 0.0
-    """leaderless as flown: an estimate of the common velocity fires that is off by so much from what the peers make of
-    it, samples tell its rate, and the law is given it; 0: samples tell the estimate alone, when motion fires"""
+    epsilon_nu_m_s: float = 0.03
+    """leaderless: an estimate of the common velocity fires that is off by so much from what the peers make of it"""
     threat: tuple[float, ...] = ()
     """leaderless: begins (s), north, east (m from where the formation starts), velocity north, east (m/s), radius (m),
     lasts (s) of what is fled (`core.law.evasion`); empty: nothing"""
@@ -272,7 +271,7 @@ class Setup:
         _check(self.plan or not self.joins, "joins", self.joins, "empty without a plan, by which a joiner comes")
         _check(len(self.threat) in (0, 7), "threat", self.threat, "seven numbers, or none")
         _check(not (self.plan and self.threat), "threat", self.threat, "empty with a plan, which nobody leaves")
-        _check(self.epsilon_nu_m_s >= 0, "epsilon_nu_m_s", self.epsilon_nu_m_s, ">= 0")
+        _check(self.epsilon_nu_m_s > 0, "epsilon_nu_m_s", self.epsilon_nu_m_s, "> 0")
         _check(not (self.plan and self.informed), "informed", self.informed, "empty with a plan, which all know")
         _check(0 <= self.nearest < n <= DENSE_MAX or not self.nearest, "nearest", self.nearest,
                f"less than the agents, {DENSE_MAX} at most")  # fmt: skip
@@ -502,7 +501,6 @@ def run_options(setup: Setup) -> Options:
         near_closest=max(setup.r0_m, setup.barrier_radius_m) + SPACING_MARGIN_M,
         near_radius=setup.barrier_radius_m,
         bound_m=setup.error_bound_m,
-        flown_nu=int(not setup.plan and setup.law == "flown" and setup.epsilon_nu_m_s > 0),
         threat_begins=setup.threat[0] if setup.threat else math.inf,
         dense_measures=int(setup.dense_measures and setup.formation.count <= DENSE_MAX),
     )

@@ -104,8 +104,6 @@ class Options(NamedTuple):
     """the safety radius of a peer whose messages are not missing (m)"""
     bound_m: float
     """on the error of every prediction"""
-    flown_nu: int
-    """1: as flown, a leaderless sample tells nu's rate, nu's error fires, and the law is given the rate"""
     threat_begins: float
     """(s); infinite: nobody is scared"""
     dense_measures: int

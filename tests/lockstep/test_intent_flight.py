@@ -6,8 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 from flights import Tape, distances, errors, failsafes, fleet, launch, straight, truth, until, wait
+from peer_faults import Liar
 
-from companion.core.values import Phase
+from companion.core.law.intent import FAR_M
+from companion.core.values import ZERO, Phase
 from companion.io.replay import replay
 from companion.vehicle.agent import Agent
 from sim.lockstep.lockstep import Lockstep
@@ -27,14 +29,14 @@ class Flown:
     moving_s: float
 
 
-def flown(plan: dict[str, Any], seconds: float, count: int = COUNT) -> Flown:
+def flown(plan: dict[str, Any], seconds: float, count: int = COUNT, loss: float = 0.2) -> Flown:
     def change(tables: dict[str, Any]) -> None:
         tables["law"]["kind"] = "intent"
         tables["plan"] = plan
 
     tape = Tape(frozenset({2}))
-    ls = launch(fleet(count, change=change), 1, NetworkParameters(loss=0.2, delay_s=0.03), tape)
-    until(ls, 60.0, lambda: ls.all_in(Phase.MOVING))
+    ls = launch(fleet(count, change=change), 1, NetworkParameters(loss=loss, delay_s=0.03), tape)
+    until(ls, 60.0, lambda: ls.all_in(Phase.MOVING) or ls.all_in(Phase.HOLDING))
     moving_s = ls.now_ns * 1e-9
     wait(ls, seconds)
     return Flown(ls, tape, moving_s)
@@ -100,3 +102,20 @@ def test_the_others_keep_clear_of_one_whose_companion_ends() -> None:
     wait(ls, 8.0)
     assert all(ls.phases()[i] in (Phase.MOVING, Phase.HOLDING) for i in ls.vehicles if i != 3)
     assert distances(truth(ls, begin_s)).min() >= 1.0
+
+
+@pytest.mark.parametrize(("off_m", "draws_m"), [(1e5, 0.4), (3.0, 1.7)])
+def test_who_lies_about_its_intended_place_draws_nobody_off_the_plan_for_ever(off_m: float, draws_m: float) -> None:
+    """A place that it cannot intend is not heeded; one that it may draws the others until the plan holds them."""
+    liar = Liar(flight=flown({"legs": [{"kind": "hold", "duration_s": 200.0}], "then": "stay"}, 2.0, loss=0.0).ls)
+    ls, liar.sequence = liar.ls, 1 << 20
+    begun_s, slots = liar.since_s, ls.positions()
+    for _ in range(160):
+        told = (ls.positions()[2].north + off_m, ls.positions()[2].east, 0.0, 0.0)
+        liar.says(liar.beside(2, 0.0, 0.0, velocity_ned_m_s=ZERO, told=told), ls.vehicles[2].agent.boot_id)
+        wait(ls, 0.25)
+    drawn = [p.north - slots[i].north for i, p in ls.positions().items()]
+    assert max(map(abs, drawn)) <= draws_m
+    assert off_m > FAR_M or min(drawn) >= 0.5, "nobody believed a word"
+    assert distances(truth(ls, begun_s)).min() >= 1.2
+    assert failsafes(ls) == []

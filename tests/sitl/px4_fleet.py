@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import socket
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +26,8 @@ from sim.launch.summary.flight import Flight as FlightRecord
 
 PATIENCE_S = 180.0
 ALTITUDE_M = 5.0
+DISTANCE_MIN_M, FORMATION_ERROR_MAX_M = 2.5, 0.30
+"""by truth"""
 GROUND_STATION = (255, 190)
 GCS_PORT = 18570
 SETPOINT = dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED
@@ -134,6 +136,21 @@ class Flying:
         )
         i, j = np.triu_indices(len(ids), 1)
         return float(np.linalg.norm(p[:, i] - p[:, j], axis=2).min())
+
+
+def judged(summary: dict[str, Any], record_property: Callable[[str, object], None]) -> dict[str, Any]:
+    """The steady part of a whole flight by its summary, whose figures go into --junitxml: judged by truth, nobody near
+    another, no failsafe, all landed."""
+    steady: dict[str, Any] = {k: v for k, v in summary["steady"].items() if k != "windows"}
+    record_property("steady", steady)
+    record_property("believed", summary["believed"])
+    record_property("minimum_distance_m", summary["minimum_distance_m"])
+    assert summary["judged_by"] == "truth"
+    assert summary["failsafes"] == []
+    assert all(summary["landed"].values())
+    assert summary["minimum_distance_m"] >= DISTANCE_MIN_M
+    assert steady["formation_error_rms_m"] <= FORMATION_ERROR_MAX_M
+    return steady
 
 
 @contextmanager

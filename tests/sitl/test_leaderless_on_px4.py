@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from fleet_process import run
-from px4_fleet import Flying, flying, sitl_fleet
+from px4_fleet import Flying, flying, judged, sitl_fleet
 
 INFORMED = [2, 4]
 STRAIGHT_S, TURN_S = 20.0, 6.0
@@ -63,12 +63,5 @@ def test_five_follow_the_two_that_are_informed_through_a_turn(
     responded_s = 0.1 * (int(np.flatnonzero(off_m_s > WITHIN_M_S)[-1]) + 1) - STRAIGHT_S
     record_property("within 0.3 m/s of the informed, after the turn's begin (s)", responded_s)
     record_property("mean velocity off by, last 10 s (m/s)", float(off_m_s[-100:].mean()))
-    record_property("steady", {k: v for k, v in summary["steady"].items() if k != "windows"})
-    record_property("believed", summary["believed"])
-    record_property("minimum_distance_m", summary["minimum_distance_m"])
-    assert summary["judged_by"] == "truth"
-    assert summary["failsafes"] == []
-    assert all(summary["landed"].values())
-    assert summary["minimum_distance_m"] >= 2.5
-    assert summary["steady"]["formation_error_rms_m"] <= 0.30
+    judged(summary, record_property)
     assert responded_s < AFTER_S

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from math import hypot, sqrt
+from math import exp, hypot, sqrt
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -16,7 +16,7 @@ from scipy.integrate import solve_ivp
 from companion.config import FleetConfig, load
 from companion.core.counts import Counts
 from companion.core.frames import Ned
-from companion.core.law.intent import FIELDS, START_M, IntentGains, IntentHold, IntentLaw
+from companion.core.law.intent import FAR_M, FIELDS, START_M, TO_PLAN_PER_S, IntentGains, IntentHold, IntentLaw
 from companion.core.neighbours.table import PeerTable
 from companion.core.prediction import Held, HoldBounds, PlainHold
 from companion.core.trajectory.fleet import Reference
@@ -224,8 +224,9 @@ def test_an_anchor_starts_where_the_vehicle_is_but_no_farther_from_its_slot_than
     near, far = law(), law()
     near.command(at(0, Ned(0.2, 0.0, -3.0)), standing(), (), alone=False)
     far.command(at(0, Ned(3.0, 4.0, -3.0)), standing(), (), alone=False)
-    assert near.tell() == pytest.approx((0.2, 0.0, 0.0, 0.0))
-    assert far.tell() == pytest.approx((0.6 * START_M, 0.8 * START_M, 0.0, 0.0))
+    back = -TO_PLAN_PER_S
+    assert near.tell() == pytest.approx((0.2, 0.0, 0.2 * back, 0.0))
+    assert far.tell() == pytest.approx((0.6 * START_M, 0.8 * START_M, 0.6 * START_M * back, 0.8 * START_M * back))
     assert far.fields == FIELDS
 
 
@@ -239,7 +240,7 @@ def agreeing(shared: bool, drifts: Sequence[float], seconds: float) -> list[tupl
         here = Ned(k * DT_S if shared else 0.0, 0.0, 0.0)
         for i, (one, slot, drift) in enumerate(zip(laws, slots, drifts, strict=True)):
             around = [
-                neighbour(j, slots[j], Ned(0.0, slot.east - slots[j].east, 0.0), told[j])
+                neighbour(j, slots[j]._replace(north=k * DT_S), Ned(0.0, slot.east - slots[j].east, 0.0), told[j])
                 for j in range(3)
                 if j != i and k > 0
             ]
@@ -251,19 +252,32 @@ def agreeing(shared: bool, drifts: Sequence[float], seconds: float) -> list[tupl
 
 @pytest.mark.parametrize("shared", [True, False])
 def test_intended_places_agree_on_their_mean_with_a_plan_and_without(shared: bool) -> None:
-    """Without one the references do not move with the vehicles; the intended places do, by the common velocity."""
+    """Without one the references do not move with the vehicles; the intended places do, by the common velocity. With
+    one the mean comes back to the plan."""
+    left = exp(-6.0 * TO_PLAN_PER_S) if shared else 1.0
     for place in agreeing(shared, (0.25, -0.1, 0.0), 6.0):
-        assert place == pytest.approx((0.05, 0.0), abs=1e-3)
+        assert place == pytest.approx((0.05 * left, 0.0), abs=1e-3)
 
 
 def test_whoever_was_apart_takes_the_mean_of_what_it_hears_and_draws_nobody() -> None:
     one = law()
-    around = [neighbour(j, Ned(9.0, 4.0 * j, 0.0), Ned(0.0, -4.0 * j, 0.0), (0.2, 4.0 * j, 0.0, 0.0)) for j in (1, 2)]
+    around = [neighbour(j, Ned(3.0, 4.0 * j, 0.0), Ned(0.0, -4.0 * j, 0.0), (0.2, 4.0 * j, 0.0, 0.0)) for j in (1, 2)]
     one.command(at(0, Ned(2.0, 1.0, 0.0)), standing(Ned(2.0, 1.0, 0.0)), around, alone=True)
     assert one.tell() == pytest.approx((2.0, 1.0, 0.0, 0.0))
     wanted = one.command(at(1, ZERO), standing(), around, alone=False)
-    assert one.tell() == pytest.approx((0.2, 0.0, 0.0, 0.0))
+    assert one.tell() == pytest.approx((0.2, 0.0, -0.2 * TO_PLAN_PER_S, 0.0))
     assert wanted.residual_ned_m == pytest.approx((0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("alone", [True, False])
+def test_who_tells_of_a_place_that_it_cannot_intend_is_not_heeded(alone: bool) -> None:
+    one = law()
+    liar = neighbour(2, Ned(0.0, 4.0, 0.0), Ned(0.0, -4.0, 0.0), (FAR_M + 0.1, 4.0, 0.0, 0.0))
+    one.command(at(0, ZERO), standing(), [liar], alone=alone)
+    one.command(at(1, ZERO), standing(), [liar], alone=False)
+    assert one.tell() == pytest.approx((0.0, 0.0, 0.0, 0.0))
+    one.command(at(2, ZERO), standing(), [liar._replace(told=(FAR_M - 0.1, 4.0, 0.0, 0.0))], alone=False)
+    assert one.tell()[2] > 0.5
 
 
 def test_whoever_is_not_in_formation_is_kept_apart_from_and_not_agreed_with() -> None:

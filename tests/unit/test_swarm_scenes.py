@@ -156,7 +156,7 @@ def test_a_share_of_the_errors_is_read_from_their_bins() -> None:
 
 FREE = replace(
     FOUR, formation=Formation(shape="grid", count=9, spacing_m=4.0), plan=False, k_p=0.0, nearest=3, links=False,
-    epsilon_nu_m_s=0.03, barrier=True, r0_m=2.0, duration_s=30.0, start_ball_m=0.1, start_velocity_m_s=0.0,
+    barrier=True, r0_m=2.0, duration_s=30.0, start_ball_m=0.1, start_velocity_m_s=0.0,
 )  # fmt: skip
 SCARED = replace(FREE, threat=(4.0, 4.0, -9.0, 0.0, 0.0, 8.0, 3.0))
 """it stands beside the formation, north of where that is by then"""
@@ -213,7 +213,7 @@ def test_the_evasion_that_is_compiled_is_the_flown_one() -> None:
         ({"nearest": 10}, "nearest must be less than the agents"),
         ({"threat": [1.0, 0.0, 0.0, 0.0, 0.0, 5.0, 3.0]}, "threat must be empty with a plan"),
         ({"plan": False, "threat": [1.0, 0.0, 0.0]}, "threat must be seven numbers"),
-        ({"epsilon_nu_m_s": -0.1}, "epsilon_nu_m_s must be >= 0"),
+        ({"epsilon_nu_m_s": 0.0}, "epsilon_nu_m_s must be > 0"),
     ],
 )
 def test_a_scene_that_cannot_be_flown_is_refused_with_a_sentence(values: dict[str, object], says: str) -> None:

@@ -13,6 +13,8 @@ from math import sqrt
 
 RATE_PER_S = 4.0
 """how fast the estimates of the common velocity approach each other"""
+STEP_MAX_S = 0.2
+"""a vehicle whose positions were gone for longer goes on from what it had agreed on then"""
 
 
 def saturated(x: float, y: float, z: float, limit: float) -> tuple[float, float, float]:

@@ -18,6 +18,8 @@ per equation, as in `law`; the swarm compiles these. A vehicle flies them by `In
   no matter whether a plan gives p_ref. Where no motion is shared, q goes on with v_d, which has w in it
   (`vehicle.agreement`; w(0) is the velocity of the shared motion before).
 * It acts on the level; altitude is flown by position.
+* With a plan c comes back to 0 at TO_PLAN_PER_S, which g has in it: among those who tell the truth it stays near where
+  it began, and whoever does not would draw it on and on.
 * c starts within START_M of the slot: whoever is farther away flies there. Whoever was apart takes the mean of what it
   hears, and drags nobody.
 * The hold predicts no more of the response than the acceleration limit allows (`IntentHold`).
@@ -30,7 +32,7 @@ from typing import NamedTuple
 
 from companion.core.frames import Ned
 from companion.core.law.base import Wanted
-from companion.core.law.consensus import saturated
+from companion.core.law.consensus import STEP_MAX_S, saturated
 from companion.core.law.starling import Gains, Sums, separation, total, within_budget
 from companion.core.prediction import Held, HoldBounds, axis, damped
 from companion.core.trajectory.fleet import Reference
@@ -40,8 +42,10 @@ FIELDS = ("intended_north_m", "intended_east_m", "anchor_north_m_s", "anchor_eas
 """what a vehicle tells: q, on the level of the fleet frame, and g"""
 START_M = 0.3
 """an anchor starts no farther from the plan's place"""
-STEP_MAX_S = 0.2
-"""a vehicle whose positions were gone for longer goes on from what it had"""
+TO_PLAN_PER_S = 0.1
+"""how fast an anchor comes back to a plan's place: nobody's words draw the fleet off it for ever"""
+FAR_M = 5.0
+"""nobody intends a place that is farther from where it is: such a word is not heeded"""
 
 
 class IntentGains(NamedTuple):
@@ -200,7 +204,7 @@ class IntentLaw:
         """See `Law`; the residual is the mean of c_i - c^_j."""
         g = self._gains
         north, east = self._intended(ego, reference, alone)
-        heard = [] if alone else [(n.told, n.offset_ned_m) for n in neighbours if n.in_formation and n.told]
+        heard = [] if alone else [(n.told, n.offset_ned_m) for n in neighbours if n.in_formation and _plausible(n)]
         off = [(north - told[0] - d.north, east - told[1] - d.east) for told, d in heard]
         each = max(len(off), 1)
         mean = sum(x for x, _ in off) / each, sum(y for _, y in off) / each
@@ -211,6 +215,11 @@ class IntentLaw:
         g_north, g_east, _ = anchor_rate(
             float(len(errors)), sum(e[0] for e in errors), sum(e[1] for e in errors), 0.0, g
         )
+        if reference.shared:
+            r = reference.position_ned_m
+            g_north, g_east, _ = saturated(
+                g_north - TO_PLAN_PER_S * (north - r.north), g_east - TO_PLAN_PER_S * (east - r.east), 0.0, g.c_max
+            )
         self._place, self._rate, self._alone = (north, east), (g_north, g_east), alone
         self._before, self._time_ns = reference, ego.time_ns
         p, v, v_d, a_d = ego.position_ned_m, ego.velocity_ned_m_s, *reference[1:3]
@@ -251,6 +260,10 @@ class IntentLaw:
     def tell(self) -> tuple[float, ...]:
         """The intended place, and its rate against the plan."""
         return (*(self._place or (0.0, 0.0)), *self._rate)
+
+
+def _plausible(n: Neighbour) -> bool:
+    return bool(n.told) and hypot(n.told[0] - n.position_ned_m.north, n.told[1] - n.position_ned_m.east) <= FAR_M
 
 
 def _apart(p: Ned, q: Ned, g: Gains) -> Sums:

@@ -32,9 +32,10 @@ class ErrorTrigger(NamedTuple):
         intended place's."""
         if now.error_common_2 >= self.epsilon_nu_m_s * self.epsilon_nu_m_s:
             return True
-        told_m = now.error_told_m
-        if anchor_exceeds(told_m * told_m, now.mean_residual_2, IntentTrigger(self.epsilon_c_m, self.kappa_c)):
-            return True
+        if now.error_told_m > 0.0:
+            intent = IntentTrigger(self.epsilon_c_m, self.kappa_c)
+            if anchor_exceeds(now.error_told_m * now.error_told_m, now.mean_residual_2, intent):
+                return True
         return exceeds(now.error_position_2, now.error_velocity_2, now.mean_residual_2, self)
 
     def error_bound_m(self, motion: PeerMotion) -> float:
