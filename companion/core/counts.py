@@ -53,6 +53,16 @@ def _restored(names: frozenset[str], counted: dict[str, int]) -> Counts:
     return counts
 
 
+def summed(*counts: Mapping[str, int]) -> dict[str, int]:
+    """Several counts in one, without what has not happened."""
+    together: dict[str, int] = {}
+    for some in counts:
+        for name, count in some.items():
+            if count:
+                together[name] = together.get(name, 0) + count
+    return together
+
+
 @unique
 class RefusalKind(StrEnum):
     """Why a motion is refused, as a name for counting."""

@@ -122,7 +122,7 @@ class PlainHold:
 
     def at(self, sample: PeerSample, then: tuple[Ned, Ned], now: Reference, tau_s: float) -> Held:
         """See `Hold`."""
-        w = weights(self.kind, tau_s, self.damping_s)
+        w = damped(tau_s, self.damping_s) if self.kind == "damped" else weights(self.kind, tau_s, self.damping_s)
         p, v = sample.position_ned_m, sample.velocity_ned_m_s
         then_p, then_v = then
         now_p, now_v = now.position_ned_m, now.velocity_ned_m_s

@@ -94,6 +94,8 @@ class Companion:
         self._file = self._configuration()
         self._file_due_ns = 0
         self._noticed: set[Failsafe] = set()
+        self._drain_failed = False
+        """what waits at the transport is asked for again, though nothing wakes the loop for it"""
         with ExitStack() as stack:
             stack.callback(self._notifier.close)
             self._wake_read, self._wake_write = socket.socketpair()
@@ -156,9 +158,12 @@ class Companion:
         ready = self._wait_until(deadline_ns)
         if self.link in ready:
             self._receive_mavlink()
+        requests: list[Request] = []
         if self._wake_read in ready:
             self._wake_read.recv(4096)
-        requests = self._receive_from_peers()
+            requests = self._receive_from_peers()
+        elif self._drain_failed:
+            requests = self._receive_from_peers()
         self._heed_stops(ready)
         self._advance(deadline_ns)
         for request in sorted(requests, key=lambda r: r.kind != "command"):
@@ -170,7 +175,9 @@ class Companion:
         return self._exit_status(now_ns)
 
     def _wait_until(self, deadline_ns: int) -> list[Any]:
-        waiting: list[Any] = [self.link, self._wake_read, *([] if self._launcher_fd is None else [self._launcher_fd])]
+        waiting: list[Any] = [self.link, self._wake_read]
+        if self._launcher_fd is not None:
+            waiting.append(self._launcher_fd)
         ready, _, _ = select.select(waiting, [], [], max(deadline_ns - time.monotonic_ns(), 0) * 1e-9)
         return ready
 
@@ -189,8 +196,9 @@ class Companion:
     def _receive_from_peers(self) -> list[Request]:
         """Hand on what peers said; returns what the operator asks, to be answered after the tick."""
         requests = []
-        events: list[Event] = self.guard.transport("drain", self.network.drain, [])
-        for event in events:
+        events: list[Event] | None = self.guard.transport("drain", self.network.drain, None)
+        self._drain_failed = events is None
+        for event in events or ():
             now = self._instant(event.received_monotonic_ns)
             match event:
                 case ReceivedSample():

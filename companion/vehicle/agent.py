@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from math import dist
 from random import Random
+from typing import Any
 
 from companion.config import FleetConfig
 from companion.core.counts import Counts
@@ -100,6 +101,9 @@ class Agent:
             config, vehicle_id, boot_id, self.autopilot, self.supervisor, self.history, self.peers, self.plans,
             self.publisher, self.agreement, self.graph, self.rejected, OrderBook(boot_id),
         )  # fmt: skip
+        parts = (self.supervisor, self.plans, self.peers, self.graph, self.autopilot)
+        self._events: tuple[list[Any], ...] = tuple(part.events for part in parts)
+        """where the parts leave what happened"""
         self.setpoints_sent = 0
         self._timer_ns = round(TIMER_SLACK * 1e9 / config.limits.control_rate_hz)
         self._ids = {str(i): i for i in others}
@@ -226,9 +230,10 @@ class Agent:
         plan = self.plans.due(now)
         if plan is not None:
             out.peers.append(("plan", plan))
-        for part in (self.supervisor, self.plans, self.peers, self.graph, self.autopilot):
-            out.events += part.events
-            part.events.clear()
+        for events in self._events:
+            if events:
+                out.events += events
+                events.clear()
         return out
 
     def _tick(self, now: Instant) -> None:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from companion.config import FleetConfig
-from companion.core.counts import Counts, Refusal
+from companion.core.counts import Counts, Refusal, summed
 from companion.core.frames import Ned, geodetic_to_ned
 from companion.core.law.evasion import Threat
 from companion.core.neighbours.table import PeerTable
@@ -234,7 +234,6 @@ class OperatorPort:
         """The vehicle's account of itself, but for what only its process knows."""
         tick, graph = activity.tick, self.graph.connectivity
         unready, newest = unmet(self.checks(now)), self.history.newest
-        rejected = self.rejected + self.supervisor.counts + self.peers.rejected
         return Status(
             vehicle=self.vehicle_id,
             phase=self.supervisor.phase.name.lower(),
@@ -260,7 +259,7 @@ class OperatorPort:
             autopilot_age_s=self.autopilot.heartbeat_age_s(now),
             configuration=self.config.shared_hash,
             failsafes=self.supervisor.failsafes[-FAILSAFES_SHOWN_MAX:],
-            rejected=dict(rejected + self.autopilot.rejected),
+            rejected=summed(self.rejected, self.supervisor.counts, self.peers.rejected, self.autopilot.rejected),
             limited=activity.limited,
             own_id_heard=self.publisher.own_id_heard(now),
             motion=motion_to_json(newest),

@@ -27,7 +27,7 @@ def own_checks(
         if place is not None:
             rows += _start_checks(facts, config, place)
         rows += facts.settings
-    return tuple(replace(row, vehicle=vehicle.id) for row in rows)
+    return tuple(row if row.vehicle else replace(row, vehicle=vehicle.id) for row in rows)
 
 
 def _link_checks(facts: AutopilotFacts, vehicle: Vehicle) -> list[Check]:

@@ -236,21 +236,25 @@ class Supervisor:
 
     def _follow_autopilot(self, now: Instant) -> None:
         """The phases that follow from what the autopilot shows."""
-        ap, mode = self.autopilot, self.autopilot.mode
-        match self.phase:
+        ap, phase = self.autopilot, self.phase
+        if phase in FILTERED_PHASES:
+            if not ap.armed:
+                self._happened(PhaseEvent.DISARMED, now)
+            return
+        match phase:
             case Phase.PREFLIGHT if ap.armed:
                 self._happened(PhaseEvent.ARMED, now)
             case Phase.ARMED | Phase.CLIMBING if not ap.armed:
                 # Its pilot has ended the take-off; take-off mode would take off whoever arms next.
                 self._happened(PhaseEvent.DISARMED, now)
                 self._pending.hold_after({TAKE_OFF}, now)
-            case phase if (phase in FLYING_PHASES or phase is Phase.RELEASED) and not ap.armed:
+            case Phase.LANDING | Phase.RELEASED if not ap.armed:
                 self._happened(PhaseEvent.DISARMED, now)
-            case Phase.ARMED if mode == TAKE_OFF:
+            case Phase.ARMED if ap.mode == TAKE_OFF:
                 self._happened(PhaseEvent.TAKING_OFF, now)
-            case Phase.CLIMBING if mode == OFFBOARD:
+            case Phase.CLIMBING if ap.mode == OFFBOARD:
                 self._happened(PhaseEvent.ENGAGED, now)
-            case Phase.LANDING if mode == LAND:
+            case Phase.LANDING if ap.mode == LAND:
                 self.flight.land_seen = True
 
     def _detect(self, now: Instant) -> None:
@@ -293,8 +297,12 @@ class Supervisor:
 
     def _lead(self, now: Instant) -> None:
         """Ask the autopilot for the phase's next step, or go on with the formation."""
-        ap = self.autopilot
-        match self.phase:
+        ap, phase = self.autopilot, self.phase
+        if phase in FILTERED_PHASES:
+            if self.flight.positioned:
+                self._lead_formation(now)
+            return
+        match phase:
             case Phase.PREFLIGHT if ap.mode == OFFBOARD:
                 ap.hold()  # left over from a flight before; without setpoints PX4 does not arm in it
             case Phase.PREFLIGHT:
@@ -307,8 +315,6 @@ class Supervisor:
                 self._lead_climb(now)
             case Phase.LANDING if not self.flight.land_seen:
                 ap.land()
-            case phase if phase in FILTERED_PHASES and self.flight.positioned:
-                self._lead_formation(now)
 
     def _lead_climb(self, now: Instant) -> None:
         """Once at altitude, stream setpoints, and then have the autopilot follow them."""

@@ -276,9 +276,11 @@ class PeerTable:
             if peer.tracks:
                 track = peer.tracks[0]
                 end_ns = track.due_ns if track.lost_at_ns is None else track.lost_at_ns
+                if end_ns >= now.fleet_ns:
+                    return 0.0
                 if newest_ns is None or end_ns > newest_ns:
                     newest_ns = end_ns
-        return None if newest_ns is None else max(now.fleet_ns - newest_ns, 0) * 1e-9
+        return None if newest_ns is None else (now.fleet_ns - newest_ns) * 1e-9
 
     def digest(self) -> tuple[PeerSample, ...]:
         """The latest samples of peers for passing on, newest first; none of a peer that is lost, or in two places."""

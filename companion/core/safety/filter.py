@@ -332,7 +332,8 @@ class SafetyFilter:
         north, east = north + bias.north, east + bias.east
         position_down, velocity_down = self._vertical(command, ego)
         velocity_down += bias.down
-        self.counts.update(self._acted)
+        if self._acted:
+            self.counts.update(self._acted)
         if not isfinite(u[0] + u[1] + north + east):
             # Finite inputs so large that their products are not.
             self.counts["not finite"] += 1

@@ -5,7 +5,7 @@ asks by verbs and learns what came of them from what the autopilot tells, since 
 again at each tick for as long as it is wanted, and the adapter sees that the link is not flooded by it.
 """
 
-from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum, unique
 from math import inf
@@ -203,7 +203,7 @@ class AutopilotPort(Protocol):
         """What preflight judges."""
 
     @property
-    def rejected(self) -> Counter[str]:
+    def rejected(self) -> Mapping[str, int]:
         """What was refused and went wrong on the link, by name."""
 
     # -- what is asked of it -------------------------------------------------------------------------------------------

@@ -4,12 +4,13 @@ PX4's quirks that shape it: GPS_GLOBAL_ORIGIN comes once after boot and must be 
 nothing of its validity; what a command has done shows in the next HEARTBEAT, which comes once a second.
 """
 
-from collections import Counter, deque
+from collections import deque
+from dataclasses import replace
 from math import dist, inf
 
 from companion.config import FleetConfig
 from companion.config.derived import Vehicle
-from companion.core.counts import Counts
+from companion.core.counts import Counts, summed
 from companion.core.events import AutopilotRebooted, Event, OriginMoved
 from companion.core.failsafe import DAMAGE_M, HEARTBEAT_S, STALE_S, STATUS_S
 from companion.core.frames import Geodetic, LocalFrame, Ned
@@ -35,6 +36,7 @@ from companion.vehicle.autopilot.round_trips import RoundTrips
 from companion.wire import mavlink as wire
 from companion.wire import px4
 from companion.wire.mavlink import MavlinkCodec
+from companion.wire.operator import Check
 from companion.wire.px4 import Px4Mode, mode_name
 
 CLOCK_SAMPLES = 5
@@ -73,6 +75,7 @@ class Px4Autopilot:
 
     def __init__(self, config: FleetConfig, vehicle: Vehicle) -> None:
         self.config = config
+        self.vehicle_id = vehicle.id
         self.fleet_origin = config.origin if config.fleet.frame == "global" else None
         self.codec = MavlinkCodec(vehicle.system_id)
         self.counts = Counts(COUNTED)
@@ -110,6 +113,9 @@ class Px4Autopilot:
         self._origin_doubted = False
         self._round_trips = RoundTrips()
         self._clock_ahead_ns: deque[int] = deque(maxlen=CLOCK_SAMPLES)
+        self._read: tuple[dict[str, float | int], set[str]] = ({}, set())
+        """of which parameters `_settings` tells: those read, and those that cannot be"""
+        self._settings: tuple[Check, ...] | None = None
 
     # -- what it says --------------------------------------------------------------------------------------------------
 
@@ -328,9 +334,9 @@ class Px4Autopilot:
         return None if self.landed_state == 0 else self.landed_state == wire.ON_GROUND
 
     @property
-    def rejected(self) -> Counter[str]:
+    def rejected(self) -> dict[str, int]:
         """What was refused and went wrong on the link, by name."""
-        return self.codec.rejected + self.counts
+        return summed(self.codec.rejected, self.counts)
 
     @property
     def _asks_origin(self) -> bool:
@@ -368,12 +374,11 @@ class Px4Autopilot:
     def facts(self, now: Instant) -> AutopilotFacts:
         """What preflight judges."""
         is_px4 = self.kind == px4.AUTOPILOT_PX4
-        parameters = self.parameters
         return AutopilotFacts(
             heartbeat_age_s=self.heartbeat_age_s(now),
             foreign_system_id=self.codec.foreign_system_id if _within(self.foreign_ns, HEARTBEAT_S, now) else None,
             identity=identity_checks(self.kind, self.vehicle_type),
-            settings=tuple(parameter_checks(parameters.values, parameters.missing, self.config)) if is_px4 else (),
+            settings=self._parameter_rows() if is_px4 else (),
             estimate=self.estimate(now),
             rc_healthy=bool(self.sensors_health & RC_RECEIVER_FLAG) and _within(self.health_ns, STATUS_S, now),
             origin=self.origin,
@@ -386,6 +391,16 @@ class Px4Autopilot:
             # The least delayed of the last messages is nearest to the truth: delay makes the autopilot seem behind.
             clock_ahead_s=max(self._clock_ahead_ns) * 1e-9 if self._clock_ahead_ns else None,
         )
+
+    def _parameter_rows(self) -> tuple[Check, ...]:
+        """Preflight's rows of the parameters, made anew when they have changed: every status looks at them."""
+        parameters = self.parameters
+        read = (parameters.values, parameters.missing)
+        if self._settings is None or read != self._read:
+            self._read = (dict(parameters.values), set(parameters.missing))
+            rows = parameter_checks(*self._read, self.config)
+            self._settings = tuple(replace(row, vehicle=self.vehicle_id) for row in rows)
+        return self._settings
 
 
 def _within(heard_ns: int | None, limit_s: float, now: Instant) -> bool:

@@ -4,7 +4,7 @@ from typing import ClassVar
 
 from companion.core.failsafe import CLIMB_S, FROZEN_S, HEARTBEAT_S, TAKE_OFF_S, Failsafe
 from companion.core.health import Debounce
-from companion.core.values import FLYING_PHASES, Instant, Phase
+from companion.core.values import FILTERED_PHASES, FLYING_PHASES, Instant, Phase
 from companion.vehicle.autopilot.port import HOLD, LAND, OFFBOARD, TAKE_OFF, Verb
 from companion.vehicle.detectors.base import Detector, Finding
 from companion.vehicle.flight import Flight
@@ -60,8 +60,10 @@ class LeftByAutopilot(_ModeLeft):
 
 def mode_is_foreign(flight: Flight) -> bool:
     """Whether the mode is one in which nobody may be who flies for us."""
-    mode, before = flight.autopilot.mode, flight.mode_before
-    match flight.phase:
+    mode, before, phase = flight.autopilot.mode, flight.mode_before, flight.phase
+    if phase in FILTERED_PHASES:
+        return mode != OFFBOARD
+    match phase:
         case Phase.ARMED:
             return mode not in (*ON_THE_WAY_UP, before)
         case Phase.CLIMBING:
