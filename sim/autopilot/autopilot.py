@@ -17,7 +17,8 @@ from companion.wire.mavlink_frames import is_one_frame
 from sim.autopilot.commander import HOME_SET_NS, Commander, Result, TakeoffState
 from sim.autopilot.commands import CommandRequest, answer, set_mode
 from sim.autopilot.disturbances import GustParameters, NoiseParameters, OrnsteinUhlenbeck, normals
-from sim.autopilot.dynamics import HOLD_STILL, DynamicsParameters, Setpoint, Vehicle
+from sim.autopilot.dynamics import Vehicle
+from sim.autopilot.dynamics_parameters import DynamicsParameters
 from sim.autopilot.estimator import Estimator
 from sim.autopilot.events import EventReporter
 from sim.autopilot.faults import LASTING, Fault, FaultKind
@@ -28,6 +29,7 @@ from sim.autopilot.offboard import SetpointFields, SetpointStream, decode_setpoi
 from sim.autopilot.packing import unpacked
 from sim.autopilot.parameters import ParameterTable, loop_gains
 from sim.autopilot.services import Services
+from sim.autopilot.setpoint import HOLD_STILL, Setpoint
 from sim.autopilot.telemetry import Telemetry
 
 STEP_NS = 4_000_000

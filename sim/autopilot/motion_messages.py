@@ -10,9 +10,9 @@ from typing import Any
 os.environ["MAVLINK20"] = "1"
 from pymavlink.dialects.v20 import development as mavlink
 
-from sim.autopilot.dynamics import NAN
 from sim.autopilot.modes import Mode
 from sim.autopilot.packing import Fields
+from sim.autopilot.setpoint import NAN
 from sim.autopilot.telemetry import Telemetry, to_body
 
 POSITION_IGNORED = 0x7

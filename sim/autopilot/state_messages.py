@@ -6,9 +6,9 @@ from typing import Any
 os.environ["MAVLINK20"] = "1"
 from pymavlink.dialects.v20 import development as mavlink
 
-from sim.autopilot.dynamics import NAN
 from sim.autopilot.modes import STANDARD_MODE, base_mode
 from sim.autopilot.packing import Fields
+from sim.autopilot.setpoint import NAN
 from sim.autopilot.telemetry import Telemetry, quaternion
 
 SENSORS_PRESENT = 0x0300402F

@@ -16,8 +16,8 @@ PACKAGES = ("companion", "sim")
 MODULES = (
     "sim/lockstep/lockstep.py", "sim/lockstep/network.py",
     *(f"sim/autopilot/{name}.py" for name in (
-        "autopilot", "commander", "disturbances", "dynamics", "estimator", "events", "link", "navigator", "offboard",
-        "parameters", "services", "telemetry",
+        "autopilot", "commander", "disturbances", "dynamics", "dynamics_parameters", "estimator", "events", "link",
+        "navigator", "offboard", "parameters", "services", "setpoint", "telemetry",
     )),
     *(f"companion/core/{name}.py" for name in (
         "estimate", "frames", "law/base", "law/starling", "prediction", "safety/filter", "trigger/base",
