@@ -16,8 +16,9 @@ PACKAGES = ("companion", "sim")
 MODULES = (
     "sim/lockstep/lockstep.py", "sim/lockstep/network.py",
     *(f"sim/autopilot/{name}.py" for name in (
-        "autopilot", "commander", "disturbances", "dynamics", "dynamics_parameters", "estimator", "events", "link",
-        "navigator", "offboard", "parameters", "services", "setpoint", "telemetry",
+        "autopilot", "commander", "disturbances", "dynamics", "dynamics_parameters", "estimator", "events",
+        "flight", "lasting_faults", "link", "navigator", "offboard", "parameters", "services", "setpoint", "telemetry",
+        "truth",
     )),
     *(f"companion/core/{name}.py" for name in (
         "estimate", "frames", "law/base", "law/starling", "prediction", "safety/filter", "trigger/base",
