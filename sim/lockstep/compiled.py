@@ -14,7 +14,7 @@ from companion.errors import CompanionError
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("companion", "sim")
 MODULES = (
-    "sim/lockstep/lockstep.py", "sim/lockstep/network.py",
+    *(f"sim/lockstep/{name}.py" for name in ("bound_count", "clockwork", "lockstep", "network")),
     *(f"sim/autopilot/{name}.py" for name in (
         "autopilot", "commander", "disturbances", "dynamics", "dynamics_parameters", "estimator", "events",
         "flight", "lasting_faults", "link", "navigator", "offboard", "parameters", "services", "setpoint", "telemetry",
