@@ -32,9 +32,10 @@ from companion.errors import ConfigError
 from sim.swarm import compiled as core
 from sim.swarm.exchange import hold_weights
 from sim.swarm.neighbour_list import NeighbourList
+from sim.swarm.options import rules_of, run_options
 from sim.swarm.plain_law import PlainLaws
 from sim.swarm.rows import CompiledLaw, as_rows, constrain
-from sim.swarm.setup import Formation, Setup, rules_of, run_options, setup_from
+from sim.swarm.setup import Formation, Setup, setup_from
 from sim.swarm.state import HOLD_DAMPED, HOLD_FIRST, HOLD_ZERO
 from sim.swarm.swarm import kernels, reference_table, run, starts, state_of
 
