@@ -21,8 +21,8 @@ MODULES = (
         "truth",
     )),
     *(f"companion/core/{name}.py" for name in (
-        "estimate", "frames", "law/base", "law/starling", "prediction", "safety/filter", "trigger/base",
-        "trigger/error", "trigger/periodic", "trigger/switching", "values", "vectors",
+        "estimate", "frames", "law/base", "law/starling", "prediction", "safety/avoidance",
+        "safety/filter", "trigger/base", "trigger/error", "trigger/periodic", "trigger/switching", "values", "vectors",
     )),
     *(
         path.relative_to(ROOT).as_posix()
