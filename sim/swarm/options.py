@@ -8,7 +8,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from companion.config.derived import SPACING_MARGIN_M
+from companion.config.bounds import SPACING_MARGIN_M
 from companion.core.law.intent import IntentGains, IntentTrigger
 from companion.core.law.starling import Gains
 from companion.core.trigger.error import ErrorTrigger
