@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from companion.errors import CompanionError
+from companion.errors import CompanionError, libraries_of
 from companion.operator import verbs
 from companion.terminal import tell, tolerate_any_encoding
 
@@ -86,9 +86,11 @@ def replay(
 ) -> None:
     """Run the agent on a recording's inputs and compare its outputs byte for byte.
 
-    Exit status: 0 the same, 1 different, or entries are missing (the first is shown), 2 no recording, or a damaged one.
+    Needs the extra replay. Exit status: 0 the same, 1 different, or entries are missing (the first is shown), 2 no
+    recording, or a damaged one.
     """
-    from companion.io.replay import replay_file
+    with libraries_of("replay"):
+        from companion.io.replay import replay_file
 
     began_s = process_time()
     result = replay_file(file)

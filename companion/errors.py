@@ -1,5 +1,7 @@
 """Errors that a user can act on. Misbehaviour of peers and autopilots is counted, not raised."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import ClassVar
 
 
@@ -27,3 +29,24 @@ class WireError(CompanionError):
 
 class RefusedError(CompanionError):
     """A command was understood and refused, by whom and why."""
+
+
+class MissingLibraryError(CompanionError):
+    """A command needs a library of an extra that is not installed; says which to install."""
+
+    exit_status = 2
+
+    def __init__(self, library: str, extra: str) -> None:
+        super().__init__(f"this command needs {library}, which is not installed: pip install 'starling-fleet[{extra}]'")
+
+
+@contextmanager
+def libraries_of(extra: str) -> Iterator[None]:
+    """Whatever library of others' is missing within is said to come with this extra."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        library = (error.name or "").split(".")[0]
+        if library in ("", "companion", "sim"):
+            raise
+        raise MissingLibraryError(library, extra) from None

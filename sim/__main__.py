@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from companion.errors import CompanionError, ConfigError
+from companion.errors import CompanionError, ConfigError, MissingLibraryError, libraries_of
 from companion.operator import verbs
 from companion.operator.verbs import FAILED, FLEET_TOML, FleetFile, Vehicles
 from companion.terminal import tell, tolerate_any_encoding
@@ -21,7 +21,6 @@ app = typer.Typer(
     no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
     help="A fleet of PX4 vehicles or of stubs: fly it, ask it, command it.",
 )  # fmt: skip
-USAGE_ERROR = 2
 
 Parameters = Annotated[
     list[str] | None, typer.Option(metavar="NAME=VALUE", help="With --autopilot px4: a PX4 parameter, repeatable.")
@@ -262,19 +261,14 @@ def main() -> None:
     """Entry point: errors that a user can act on end with a sentence, not a traceback."""
     tolerate_any_encoding()
     try:
-        app(standalone_mode=True)
+        with libraries_of("sim"):
+            app(standalone_mode=True)
+    except MissingLibraryError as error:
+        tell(f"fleet: {error}. The operator's verbs (status, land, kill, ...) need no extra", error=True)
+        raise SystemExit(error.exit_status) from None
     except CompanionError as error:
         tell(f"fleet: {error}", error=True)
         raise SystemExit(error.exit_status) from None
-    except ModuleNotFoundError as error:
-        if error.name is None or error.name.split(".")[0] in ("companion", "sim"):
-            raise
-        tell(
-            f"fleet: this command needs {error.name}, which is not installed: pip install 'starling-fleet[sim]'. "
-            "The operator's verbs (status, land, kill, ...) need no extra",
-            error=True,
-        )
-        raise SystemExit(USAGE_ERROR) from None
 
 
 if __name__ == "__main__":

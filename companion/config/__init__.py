@@ -3,6 +3,7 @@
     numbers     kinds of number and the base of every table
     law_tables  the tables of law and trigger
     schema      every other table, and the file as a whole
+    bounds      what follows of errors, distances and times, whoever the vehicles are
     derived     FleetConfig: what follows from the file, so that all vehicles compute the same
     checks      faults that only several values together show
     endpoints   addresses and ports of links

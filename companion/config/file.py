@@ -8,8 +8,9 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from companion.config.bounds import t_max_default_s
 from companion.config.checks import faults
-from companion.config.derived import FleetConfig, t_max_default_s
+from companion.config.derived import FleetConfig
 from companion.config.messages import sentence
 from companion.config.schema import NOTICE_LEAST_S, NOTICE_MOST_S
 from companion.errors import ConfigError

@@ -1,15 +1,18 @@
 """The flight recorder: writes what `companion.io.recording` reads.
 
 `record` only appends to a deque. A writer thread packs small batches and writes between them, which gives the
-interpreter's lock back: the control thread never waits for more than one batch's packing. Messages are packed here with
-one `struct` call, in a third of the time of the library's writer, and read back alike.
+interpreter's lock back: the control thread never waits for more than one batch's packing. A message is packed with one
+`struct` call, in a third of the time of the `mcap` package's writer.
+
+Messages are not gathered in chunks, and each write ends with a whole message: of a killed process everything that was
+written is readable, which is all but the last quarter of a second. The file is synchronised with the disk each second,
+so that a power cut takes little more. A closed file has a summary with channels and statistics.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
-import struct
 import threading
 import time
 import zlib
@@ -19,11 +22,17 @@ from pathlib import Path
 from types import TracebackType
 from typing import Final, NamedTuple, Self
 
-from mcap.data_stream import RecordBuilder
-from mcap.records import Channel, DataEnd, Footer, Header, Metadata, MetadataIndex, Statistics
-
 from companion.core.values import Instant
-from companion.io.recording import LOSS, MAGIC, MESSAGE_FIELDS, MESSAGE_OPCODE, METADATA, SEQUENCE_MASK
+from companion.io import mcap_records as mcap
+from companion.io.mcap_records import (
+    LOSS,
+    MAGIC,
+    MESSAGE_FIELDS,
+    MESSAGE_HEAD,
+    MESSAGE_OPCODE,
+    METADATA,
+    SEQUENCE_MASK,
+)
 
 QUEUE_CAPACITY: Final = 32_768
 """entries waiting for the disk: about a minute's worth"""
@@ -33,8 +42,6 @@ WRITE_INTERVAL_S: Final = 0.25
 SYNCHRONISE_INTERVAL_S: Final = 1.0
 CLOSE_TIMEOUT_S: Final = 5.0
 _PROFILE: Final = "starling-fleet"
-_MESSAGE: Final = struct.Struct("<BQHIqq")
-"""opcode, length of what follows, channel, sequence, log_time, publish_time; then the body"""
 
 
 class _Pending(NamedTuple):
@@ -74,18 +81,19 @@ class Recorder:
         self._closed = False
         self._stop = threading.Event()
         self._channels: dict[str, int] = {}
-        self._statistics = Statistics(0, 0, {}, 0, 0, 0, 0, 0, 0)
-        self._metadata_indexes: list[MetadataIndex] = []
+        self._counts: dict[int, int] = {}
+        """messages of each channel"""
+        self._first_ns = self._last_ns = 0
+        """log_time of the first and of the last of them"""
+        self._metadata: list[bytes] = []
+        """where metadata stand: for the summary"""
         self._size = 0
         self._checksum = 0
         """CRC-32 of what is written"""
         self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
         try:
-            builder = RecordBuilder()
-            builder.write(MAGIC)
-            Header(_PROFILE, "").write(builder)
-            self._add_metadata(builder, METADATA, metadata)
-            self._write(builder.end())
+            head = MAGIC + mcap.header(_PROFILE, "")
+            self._write(head + self._indexed(len(head), METADATA, metadata))
         except BaseException:
             os.close(self._fd)
             raise
@@ -150,7 +158,7 @@ class Recorder:
 
     def _write_batch(self, batch: list[_Pending]) -> None:
         channels = self._channels
-        pack = _MESSAGE.pack
+        pack = MESSAGE_HEAD.pack
         parts: list[bytes] = []
         fresh: list[str] = []
         for sequence, name, now, body in batch:
@@ -158,7 +166,7 @@ class Recorder:
             if channel is None:
                 channel = channels[name] = len(channels) + 1
                 fresh.append(name)
-                parts.append(_channel_record(channel, name))
+                parts.append(mcap.channel(channel, name, _PROFILE))
             length = MESSAGE_FIELDS.size + len(body)
             monotonic_ns, fleet_ns = now
             parts.append(pack(MESSAGE_OPCODE, length, channel, sequence & SEQUENCE_MASK, fleet_ns, monotonic_ns))
@@ -174,16 +182,13 @@ class Recorder:
             self._count(batch)
 
     def _count(self, batch: list[_Pending]) -> None:
-        statistics = self._statistics
-        counts = statistics.channel_message_counts
+        # Fleet time does not go back.
+        if not self._counts:
+            self._first_ns = max(0, batch[0].instant.fleet_ns)
+        self._last_ns = max(0, batch[-1].instant.fleet_ns)
         for name, count in Counter(entry.channel for entry in batch).items():
             channel = self._channels[name]
-            counts[channel] = counts.get(channel, 0) + count
-        first, last = batch[0].instant.fleet_ns, batch[-1].instant.fleet_ns  # fleet time does not go back
-        if statistics.message_count == 0:
-            statistics.message_start_time = max(0, first)
-        statistics.message_end_time = max(0, last)
-        statistics.message_count += len(batch)
+            self._counts[channel] = self._counts.get(channel, 0) + count
 
     def _write(self, data: bytes) -> None:
         """All of it behind what is there, or nothing."""
@@ -209,38 +214,22 @@ class Recorder:
         if self._failure is None:
             self._failure = str(error)
 
-    def _add_metadata(self, builder: RecordBuilder, name: str, values: Mapping[str, str]) -> None:
-        before = builder.count
-        Metadata(name, dict(values)).write(builder)
-        self._metadata_indexes.append(MetadataIndex(self._size + before, builder.count - before, name))
+    def _indexed(self, before: int, name: str, values: Mapping[str, str]) -> bytes:
+        """The metadata's record, `before` bytes behind what is written, as the summary will name it."""
+        record = mcap.metadata(name, values)
+        self._metadata.append(mcap.metadata_index(self._size + before, len(record), name))
+        return record
 
     def _finish(self) -> None:
         """Loss if any, end of data, summary, footer."""
-        builder = RecordBuilder()
-        if self.lost:
-            self._add_metadata(builder, LOSS, {"entries": str(self.lost)})
-        head = builder.end()
-        builder = RecordBuilder()
-        # 0 stands for none.
-        DataEnd(zlib.crc32(head, self._checksum)).write(builder)
-        summary_start = self._size + len(head) + builder.count
-        for name, channel in self._channels.items():
-            builder.write(_channel_record(channel, name))
-        self._statistics.channel_count = len(self._channels)
-        self._statistics.metadata_count = len(self._metadata_indexes)
-        self._statistics.write(builder)
-        for index in self._metadata_indexes:
-            index.write(builder)
-        Footer(summary_start, 0, 0).write(builder)
-        builder.write(MAGIC)
+        loss = self._indexed(0, LOSS, {"entries": str(self.lost)}) if self.lost else b""
+        end = loss + mcap.data_end(zlib.crc32(loss, self._checksum))
+        channels = [mcap.channel(channel, name, _PROFILE) for name, channel in self._channels.items()]
+        counted = mcap.statistics(
+            self._counts, self._first_ns, self._last_ns, channels=len(channels), metadata=len(self._metadata)
+        )
+        summary = b"".join((*channels, counted, *self._metadata))
         try:
-            self._write(head + builder.end())
+            self._write(end + summary + mcap.footer(self._size + len(end)) + MAGIC)
         except OSError as error:
             self._fail(error)
-
-
-def _channel_record(channel: int, name: str) -> bytes:
-    builder = RecordBuilder()
-    Channel(id=channel, topic=name, message_encoding=_PROFILE, metadata={}, schema_id=0).write(builder)
-    data: bytes = builder.end()
-    return data

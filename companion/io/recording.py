@@ -1,20 +1,7 @@
-"""Flight recordings: every input and output of an agent in the order of the calls, as an MCAP file; their format, and
-how they are read, whole or damaged.
+"""Flight recordings as they are read, whole or damaged; `companion.io.mcap_records` has their form.
 
-One entry is one MCAP message:
-
-    channel        topic; by convention `input/...`, `output/...`, `advance`, and notes of the loop such as `tick`
-    log_time       fleet_ns of the entry's Instant (ns since 1970)
-    publish_time   monotonic_ns of the entry's Instant (ns); both times are two's complement, so that any int64 returns
-    sequence       counts every call of `record` modulo 2^32, lost ones too: a gap is a loss, however the process ended
-    data           the body, verbatim: a MAVLink frame, a peer's payload behind its key, ...
-
-What the agent was made from (configuration, vehicle id, boot id, versions, seed) is the metadata record `recording`
-ahead of the first message. Order is the order in the file; times may be equal and are not what a reader sorts by.
-
-Messages are not gathered in chunks, and each write ends with a whole message: of a killed process everything that was
-written is readable, which is all but the last quarter of a second. The file is synchronised with the disk each second,
-so that a power cut takes little more. A closed file has a summary with channels and statistics.
+What flies writes recordings and reads none: this module needs the `mcap` package (extra `replay`), by whose reading of
+channels and metadata what the companion packs itself is understood.
 """
 
 from __future__ import annotations
@@ -36,15 +23,17 @@ from mcap.records import Channel, DataEnd, Metadata
 
 from companion.core.values import Instant
 from companion.errors import CompanionError
+from companion.io.mcap_records import (
+    LOSS,
+    MAGIC,
+    MESSAGE_FIELDS,
+    MESSAGE_OPCODE,
+    METADATA,
+    RECORD_HEAD,
+    SEQUENCE_MASK,
+)
 
-MAGIC: Final = b"\x89MCAP0\r\n"
-METADATA: Final = "recording"
-LOSS: Final = "loss"
-_RECORD_HEAD: Final = struct.Struct("<BQ")
-MESSAGE_FIELDS: Final = struct.Struct("<HIqq")
-MESSAGE_OPCODE: Final = int(Opcode.MESSAGE)
 _RECORD_MAX_BYTES: Final = 1 << 28
-SEQUENCE_MASK: Final = 0xFFFF_FFFF
 _AMONG_ENTRIES: Final = frozenset({Opcode.HEADER, Opcode.METADATA, Opcode.SCHEMA, Opcode.ATTACHMENT})
 _Record = TypeVar("_Record")
 
@@ -209,10 +198,10 @@ class Recording:
                 raise RecordingError(self.path, "is no MCAP file")
             while True:
                 offset = file.tell()
-                head = file.read(_RECORD_HEAD.size)
-                if len(head) < _RECORD_HEAD.size:
+                head = file.read(RECORD_HEAD.size)
+                if len(head) < RECORD_HEAD.size:
                     break
-                opcode, length = _RECORD_HEAD.unpack(head)
+                opcode, length = RECORD_HEAD.unpack(head)
                 if length > _RECORD_MAX_BYTES:
                     raise RecordingError(self.path, f"a record of {length} bytes", offset)
                 content = file.read(length)

@@ -7,28 +7,32 @@ PX4's own simulation step. The same seed and the same calls give the same bytes.
 import os
 import random
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 os.environ["MAVLINK20"] = "1"
 from pymavlink.dialects.v20 import development as mavlink
 
 from companion.core.frames import Geodetic, Ned, ned_to_geodetic
 from companion.wire.mavlink_frames import is_one_frame
-from sim.autopilot.commander import HOME_SET_NS, Commander, Result, TakeoffState
+from sim.autopilot.commander import HOME_SET_NS, Commander, Result
 from sim.autopilot.commands import CommandRequest, answer, set_mode
 from sim.autopilot.disturbances import GustParameters, NoiseParameters, OrnsteinUhlenbeck, normals
-from sim.autopilot.dynamics import HOLD_STILL, DynamicsParameters, Setpoint, Vehicle
+from sim.autopilot.dynamics import Vehicle
+from sim.autopilot.dynamics_parameters import DynamicsParameters
 from sim.autopilot.estimator import Estimator
 from sim.autopilot.events import EventReporter
 from sim.autopilot.faults import LASTING, Fault, FaultKind
+from sim.autopilot.flight import Flight
+from sim.autopilot.lasting_faults import LastingFaults
 from sim.autopilot.link import COMPONENT_ID, Link, StreamSchedule
 from sim.autopilot.modes import Mode
 from sim.autopilot.navigator import Navigator
-from sim.autopilot.offboard import SetpointFields, SetpointStream, decode_setpoint
+from sim.autopilot.offboard import SetpointFields, decode_setpoint
 from sim.autopilot.packing import unpacked
 from sim.autopilot.parameters import ParameterTable, loop_gains
 from sim.autopilot.services import Services
 from sim.autopilot.telemetry import Telemetry
+from sim.autopilot.truth import TruthState
 
 STEP_NS = 4_000_000
 """grid of the dynamics and of everything that is sent, ns"""
@@ -43,27 +47,6 @@ BATTERY_LOWEST_FRACTION = 0.5
 SETPOINT = mavlink.MAVLink_set_position_target_local_ned_message
 SETPOINT_KEY = SETPOINT.id.to_bytes(3, "little")
 NO_OFFSET = Ned(0.0, 0.0, 0.0)
-
-
-class TruthState(NamedTuple):
-    """What is true of the vehicle, whatever its estimator says."""
-
-    time_ns: int
-    """host's monotonic time of this state, on the grid, ns"""
-    position_ned_m: Ned
-    """fleet frame"""
-    velocity_ned_m_s: Ned
-    acceleration_ned_m_s2: Ned
-    yaw_rad: float
-    armed: bool
-    custom_mode: int
-    landed_state: int
-    setpoint_gap_max_s: float
-    """longest time without a valid set-point while OFFBOARD flew"""
-    setpoint_count: int
-    """valid offboard set-points since boot"""
-    setpoint_last_ns: int | None
-    """host's monotonic time of the last one"""
 
 
 class Autopilot:
@@ -142,12 +125,10 @@ class Autopilot:
         self.schedule = StreamSchedule(self.link, self.telemetry)
         self._services = Services(self.link, self.parameters, self._apply_parameters)
         self._events = EventReporter(self.link, self.commander)
-        self._stream = SetpointStream()
-        self._flown_mode = self.commander.mode
+        self._flight = Flight(self.commander, self.navigator, self.vehicle, self.telemetry)
         self._origin_announced = False
         self._home_set = False
-        self._wants_takeoff = False
-        self._fault_ends_ns: dict[FaultKind, float] = {}
+        self._faults = LastingFaults(self._estimator, self.telemetry, self.link)
         self._reboot_wanted = False
         self._apply_parameters()
         self._estimator.step(0)
@@ -210,20 +191,15 @@ class Autopilot:
             armed=commander.armed,
             custom_mode=commander.mode.custom_mode,
             landed_state=int(commander.landed_state),
-            setpoint_gap_max_s=self._stream.gap_max_ns / 1e9,
-            setpoint_count=self._stream.count,
+            setpoint_gap_max_s=self._flight.stream.gap_max_ns / 1e9,
+            setpoint_count=self._flight.stream.count,
             setpoint_last_ns=None if last_ns is None else self._boot_ns + last_ns,
         )
 
     def inject(self, fault: Fault) -> None:
         """Breaks something from now on, for as long as the fault says."""
         if fault.kind in LASTING:
-            begins = fault.duration_s > 0.0
-            self._lasting(fault.kind, fault.strength, begins=begins)
-            if begins:
-                self._fault_ends_ns[fault.kind] = self.now_ns + fault.duration_s * 1e9
-            else:
-                self._fault_ends_ns.pop(fault.kind, None)
+            self._faults.order(fault, self.now_ns)
             return
         match fault.kind:
             case FaultKind.ESTIMATOR_RESET:
@@ -239,27 +215,6 @@ class Autopilot:
                 self.commander.move_sticks(self.now_ns)
             case FaultKind.RC_KILL:
                 self.commander.kill(self.now_ns)
-
-    # Faults
-
-    def _lasting(self, kind: FaultKind, strength: float, *, begins: bool) -> None:
-        match kind:
-            case FaultKind.GPS_LOST:
-                if begins:
-                    self._estimator.lose_gps(strength, self.now_ns)
-                else:
-                    self._estimator.regain_gps()
-            case FaultKind.POSITION_FROZEN:
-                self._estimator.freeze(begins)
-            case FaultKind.NOISE:
-                self._estimator.add_noise(strength if begins else 0.0)
-            case FaultKind.LOW_BATTERY:
-                self.telemetry.battery_forced = strength if begins else None
-            case FaultKind.MUTE:
-                self.link.muted = begins
-                self.link.forget()
-            case FaultKind.SLOW_LINK:
-                self.link.bytes_per_s = max(strength, 1.0) if begins else float("inf")
 
     def _move_origin(self, by_ned_m: Ned) -> None:
         """The estimator's origin moves in the fleet frame; nothing true changes."""
@@ -280,15 +235,14 @@ class Autopilot:
         self._steps += 1
         gust = self._gust
         gust.step()
-        self._fly(now)
+        self._flight.step(now, STEP_S)
         self.vehicle.move(gust.north, gust.east, gust.down, STEP_S)
         if self._steps % ESTIMATE_STEPS == 0:
             self._estimator.step(now)
         self._drain_battery()
-        self.commander.step(now, wants_takeoff=self._wants_takeoff)
+        self.commander.step(now, wants_takeoff=self._flight.wants_takeoff)
         self._events.step()
-        if self._fault_ends_ns:
-            self._end_faults(now)
+        self._faults.end_due(now)
         if not self._home_set and now >= HOME_SET_NS:
             self._home_set = True
             self._set_home()
@@ -302,72 +256,6 @@ class Autopilot:
         if self._reboot_wanted:
             self.reboot()
 
-    def _fly(self, now_ns: int) -> None:
-        commander, vehicle, telemetry = self.commander, self.vehicle, self.telemetry
-        mode = commander.mode
-        if mode is not self._flown_mode:
-            self._enter(mode)
-        if not commander.armed:
-            self._wants_takeoff = False
-            telemetry.setpoint = None
-            vehicle.idle()
-            return
-        if mode is Mode.OFFBOARD:
-            self._stream.watch(now_ns, commander.setpoint_last_ns)
-            setpoint = self._stream.setpoint
-        else:
-            setpoint = self._setpoint(mode)
-        if commander.takeoff_state is not TakeoffState.FLIGHT:
-            self._wants_takeoff = self._asks_for_takeoff(mode, setpoint)
-        if not commander.motors_run:
-            telemetry.setpoint = None
-            vehicle.idle()
-            return
-        telemetry.setpoint = setpoint
-        vehicle.gains.speed_max_up_m_s = commander.speed_up_limit_m_s(now_ns)
-        vehicle.thrust_min_g = commander.thrust_min_g
-        vehicle.control(setpoint, STEP_S)
-        if mode is Mode.TAKEOFF and self.navigator.takeoff_done:
-            commander.choose(Mode.LOITER, now_ns)
-
-    def _setpoint(self, mode: Mode) -> Setpoint:
-        commander, vehicle = self.commander, self.vehicle
-        if mode.is_manual and commander.pilot_present:
-            return HOLD_STILL
-        return self.navigator.setpoint(
-            mode,
-            vehicle.down_m + vehicle.position_error_down_m,
-            self.telemetry.height_m,
-            STEP_S,
-            lifted=not vehicle.on_ground,
-            may_climb=commander.motors_run and commander.speed_up_limit_m_s(self.now_ns) > 0.0,
-        )
-
-    def _asks_for_takeoff(self, mode: Mode, setpoint: Setpoint) -> bool:
-        if mode is Mode.TAKEOFF:
-            return True
-        if mode is not Mode.OFFBOARD:
-            return False
-        down = self.vehicle.down_m + self.vehicle.position_error_down_m
-        return setpoint.down_m < down or setpoint.velocity_down_m_s < 0.0 or setpoint.acceleration_down_m_s2 < 0.0
-
-    def _enter(self, mode: Mode) -> None:
-        before, self._flown_mode = self._flown_mode, mode
-        if mode is Mode.OFFBOARD:
-            self._stream.enter(self.now_ns)
-            return
-        vehicle = self.vehicle
-        self.navigator.enter(
-            mode,
-            (
-                vehicle.north_m + vehicle.position_error_north_m,
-                vehicle.east_m + vehicle.position_error_east_m,
-                vehicle.down_m + vehicle.position_error_down_m,
-            ),
-            (vehicle.velocity_north_m_s, vehicle.velocity_east_m_s, vehicle.velocity_down_m_s),
-            keep_altitude=before is Mode.TAKEOFF and self.navigator.takeoff_done,
-        )
-
     def _drain_battery(self) -> None:
         telemetry, commander = self.telemetry, self.commander
         fraction = telemetry.battery_fraction
@@ -378,11 +266,6 @@ class Autopilot:
         elif fraction > BATTERY_LOWEST_FRACTION:
             fraction -= BATTERY_DRAIN_PER_STEP
         telemetry.battery_fraction = commander.battery_fraction = fraction
-
-    def _end_faults(self, now_ns: int) -> None:
-        for kind in [kind for kind, end_ns in self._fault_ends_ns.items() if now_ns >= end_ns]:
-            del self._fault_ends_ns[kind]
-            self._lasting(kind, 0.0, begins=False)
 
     def _set_home(self) -> None:
         self.telemetry.set_home(self.now_ns)
@@ -413,8 +296,7 @@ class Autopilot:
     def change_mode(self, mode: Mode) -> Result:
         """A user's mode change."""
         result = self.commander.choose(mode, self.now_ns)
-        if self.commander.mode is not self._flown_mode:
-            self._enter(self.commander.mode)
+        self._flight.follow_mode(self.now_ns)
         return result
 
     def order_reboot(self) -> None:
@@ -477,14 +359,7 @@ class Autopilot:
         if setpoint is None:
             self._reject(reason)
             return
-        commander, stream = self.commander, self._stream
-        commander.setpoint_seen = True
-        commander.setpoint_last_ns = self.now_ns
-        stream.count += 1
-        if commander.mode is Mode.OFFBOARD:
-            if self._flown_mode is not Mode.OFFBOARD:
-                self._enter(Mode.OFFBOARD)
-            stream.setpoint = setpoint if setpoint.is_flyable() else HOLD_STILL
+        self._flight.take_setpoint(setpoint, self.now_ns)
 
     def _take_command(self, message: Any) -> None:
         if isinstance(message, mavlink.MAVLink_command_int_message):

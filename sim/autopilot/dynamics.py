@@ -14,11 +14,10 @@ Two models share one body:
 """
 
 import math
-from dataclasses import dataclass
 from math import cos, hypot, isnan, remainder, sin, tan
-from typing import Literal, NamedTuple
 
-from sim.autopilot.disturbances import require
+from sim.autopilot.dynamics_parameters import DynamicsParameters, LoopGains
+from sim.autopilot.setpoint import NAN, Setpoint
 
 GRAVITY_M_S2 = 9.80665
 """standard gravity, CONSTANTS_ONE_G of PX4"""
@@ -27,90 +26,6 @@ THRUST_MIN_G = 0.24
 LANDED_THRUST_LOSS = 0.68
 """share of the weight no longer carried at which the land detector calls the thrust low: MPC_THR_MIN plus a tenth of
 the way to hover"""
-NAN = math.nan
-
-
-class Setpoint(NamedTuple):
-    """What a controller is asked to reach, in the frame of its own position; NaN: this axis is not controlled by it."""
-
-    north_m: float = NAN
-    east_m: float = NAN
-    down_m: float = NAN
-    velocity_north_m_s: float = NAN
-    velocity_east_m_s: float = NAN
-    velocity_down_m_s: float = NAN
-    acceleration_north_m_s2: float = NAN
-    acceleration_east_m_s2: float = NAN
-    acceleration_down_m_s2: float = NAN
-    yaw_rad: float = NAN
-    yaw_rate_rad_s: float = NAN
-
-    def is_flyable(self) -> bool:
-        """PX4's own check: every axis is controlled by something, and north and east are given in pairs."""
-        north, east, down, v_north, v_east, v_down, a_north, a_east, a_down = (not isnan(x) for x in self[:9])
-        if north is not east or v_north is not v_east or a_north is not a_east:
-            return False
-        return (north or v_north or a_north) and (down or v_down or a_down)
-
-
-HOLD_STILL = Setpoint(velocity_north_m_s=0.0, velocity_east_m_s=0.0, velocity_down_m_s=0.0)
-"""zero velocity on every axis: what PX4 flies when a set-point cannot be flown"""
-
-
-@dataclass(frozen=True, slots=True)
-class DynamicsParameters:
-    """Physics of one vehicle, and the loop's constants that PX4 does not offer as parameters."""
-
-    model: Literal["px4", "ideal"] = "px4"
-    """`px4`: PX4's loops; `ideal`: double integrator for studies"""
-    attitude_lag_s: float = 0.15
-    """time constant from commanded to flown horizontal acceleration (tilt), s; 0: none"""
-    thrust_lag_s: float = 0.07
-    """time constant from commanded to flown vertical acceleration (motors), s; 0: none"""
-    drag_per_s: float = 0.1
-    """linear drag: acceleration -drag·v, 1/s. PX4's SIH: 1.0 by default"""
-    thrust_max_g: float = 2.0
-    """largest thrust per mass, in units of gravity"""
-    ideal_velocity_gain_per_s: float = 2.0
-    """`ideal` only: acceleration per velocity error, 1/s"""
-    ideal_position_gain_per_s: float = 0.5
-    """`ideal` only: velocity per position error, 1/s; a quarter of the velocity gain is critically damped"""
-    yaw_gain_per_s: float = 2.8
-    """yaw rate per yaw error, 1/s (MC_YAW_P)"""
-    yaw_rate_max_rad_s: float = 1.05
-    """largest yaw rate, rad/s (MPC_YAWRAUTO_MAX, 60 deg/s)"""
-
-    def __post_init__(self) -> None:
-        if self.model not in ("px4", "ideal"):
-            raise ValueError(f"model must be 'px4' or 'ideal', got {self.model!r}")
-        for name in ("attitude_lag_s", "thrust_lag_s", "drag_per_s"):
-            require(name, getattr(self, name), 0.0 <= getattr(self, name) < math.inf, ">= 0")
-        for name in (
-            "ideal_velocity_gain_per_s",
-            "ideal_position_gain_per_s",
-            "yaw_gain_per_s",
-            "yaw_rate_max_rad_s",
-        ):
-            require(name, getattr(self, name), 0.0 < getattr(self, name) < math.inf, "> 0")
-        require("thrust_max_g", self.thrust_max_g, 1.0 < self.thrust_max_g < math.inf, "> 1")
-
-
-@dataclass(slots=True)
-class LoopGains:
-    """PX4's controller parameters (MPC_*); mutable, since PARAM_SET acts on them in flight."""
-
-    position_horizontal_per_s: float = 0.95
-    position_vertical_per_s: float = 1.0
-    velocity_horizontal_p: float = 1.8
-    velocity_horizontal_i: float = 0.4
-    velocity_horizontal_d: float = 0.2
-    velocity_vertical_p: float = 4.0
-    velocity_vertical_i: float = 2.0
-    velocity_vertical_d: float = 0.0
-    speed_max_horizontal_m_s: float = 12.0
-    speed_max_up_m_s: float = 3.0
-    speed_max_down_m_s: float = 1.5
-    tilt_max_rad: float = math.radians(45.0)
 
 
 def constrain_horizontal(

@@ -9,8 +9,8 @@ from typing import Any
 os.environ["MAVLINK20"] = "1"
 from pymavlink.dialects.v20 import development as mavlink
 
-from sim.autopilot.packing import frame, packed
-from sim.autopilot.streams import ON_REQUEST, STREAMS, Fields
+from sim.autopilot.packing import Fields, frame, packed
+from sim.autopilot.streams import ON_REQUEST, STREAMS
 from sim.autopilot.telemetry import Telemetry
 
 FIRST_MESSAGE_NS = 1_600_000_000

@@ -6,9 +6,9 @@ acceleration, so that a mode change does not throw the vehicle about.
 
 import math
 
-from sim.autopilot.dynamics import HOLD_STILL, NAN, Setpoint
 from sim.autopilot.modes import Mode
 from sim.autopilot.parameters import ParameterTable
+from sim.autopilot.setpoint import HOLD_STILL, NAN, Setpoint
 
 APPROACH_GAIN_PER_S = 0.9
 """speed per remaining distance of a reference at most, 1/s"""

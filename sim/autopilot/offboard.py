@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 os.environ["MAVLINK20"] = "1"
 from pymavlink.dialects.v20 import development as mavlink
 
-from sim.autopilot.dynamics import HOLD_STILL, NAN, Setpoint
+from sim.autopilot.setpoint import HOLD_STILL, NAN, Setpoint
 
 FORCE_BIT = 1 << 9
 YAW_BIT = 10

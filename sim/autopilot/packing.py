@@ -4,7 +4,7 @@ import os
 from collections.abc import Callable
 from functools import cache
 from operator import attrgetter
-from typing import Any
+from typing import Any, NamedTuple
 
 os.environ.setdefault("MAVLINK20", "1")
 # CURRENT_MODE (436) is not in the `common` dialect of pymavlink 2.4; `development` includes all of `common`.
@@ -12,7 +12,16 @@ from pymavlink.dialects.v20 import development as mavlink
 
 from companion.wire.mavlink_frames import HEAD_2, Layout, checksum_fits
 
-__all__ = ["frame", "mavlink", "packed", "unpacked"]
+__all__ = ["Fields", "frame", "mavlink", "packed", "unpacked"]
+
+
+class Fields(NamedTuple):
+    """A message that a companion has sent many times a second, without pymavlink's object around its values."""
+
+    kind: Any
+    """its class in pymavlink"""
+    values: tuple[Any, ...]
+    """of its fields in the wire's order"""
 
 
 @cache

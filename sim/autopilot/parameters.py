@@ -7,7 +7,7 @@ import math
 import struct
 from collections.abc import Mapping
 
-from sim.autopilot.dynamics import LoopGains
+from sim.autopilot.dynamics_parameters import LoopGains
 
 TYPE_INT32 = 6
 """MAV_PARAM_TYPE_INT32"""

@@ -10,7 +10,7 @@ from companion.config.endpoints import autopilot_port, companion_port, udp_endpo
 from companion.core.frames import Ned
 from companion.errors import ConfigError
 from sim.autopilot.disturbances import GustParameters, NoiseParameters
-from sim.autopilot.dynamics import DynamicsParameters
+from sim.autopilot.dynamics_parameters import DynamicsParameters
 from sim.autopilot.parameters import defaults
 from sim.autopilot.stubs import StubFleetSettings, StubVehicleSettings
 

@@ -24,11 +24,12 @@ import numpy as np
 
 from companion.core.frames import Geodetic, Ned
 from companion.errors import CompanionError
-from sim.autopilot.autopilot import NO_OFFSET, Autopilot, TruthState
+from sim.autopilot.autopilot import NO_OFFSET, Autopilot
 from sim.autopilot.disturbances import GustParameters, NoiseParameters
-from sim.autopilot.dynamics import DynamicsParameters
+from sim.autopilot.dynamics_parameters import DynamicsParameters
 from sim.autopilot.faults import decode_order
 from sim.autopilot.ground import GroundLink
+from sim.autopilot.truth import TruthState
 
 log = logging.getLogger(__name__)
 TRUTH_DTYPE = np.dtype(

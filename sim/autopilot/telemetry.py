@@ -4,8 +4,9 @@ import math
 
 from companion.core.frames import Geodetic, Ned
 from sim.autopilot.commander import Commander
-from sim.autopilot.dynamics import GRAVITY_M_S2, Setpoint, Vehicle
+from sim.autopilot.dynamics import GRAVITY_M_S2, Vehicle
 from sim.autopilot.parameters import ParameterTable
+from sim.autopilot.setpoint import Setpoint
 
 WGS84_SEMI_MAJOR_M = 6_378_137.0
 WGS84_ECCENTRICITY_SQUARED = 6.69437999014e-3

@@ -14,14 +14,15 @@ from companion.errors import CompanionError
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("companion", "sim")
 MODULES = (
-    "sim/lockstep/lockstep.py", "sim/lockstep/network.py",
+    *(f"sim/lockstep/{name}.py" for name in ("bound_count", "clockwork", "lockstep", "network")),
     *(f"sim/autopilot/{name}.py" for name in (
-        "autopilot", "commander", "disturbances", "dynamics", "estimator", "events", "link", "navigator", "offboard",
-        "parameters", "services", "telemetry",
+        "autopilot", "commander", "disturbances", "dynamics", "dynamics_parameters", "estimator", "events",
+        "flight", "lasting_faults", "link", "navigator", "offboard", "parameters", "services", "setpoint", "telemetry",
+        "truth",
     )),
     *(f"companion/core/{name}.py" for name in (
-        "estimate", "frames", "law/base", "law/starling", "prediction", "safety/filter", "trigger/base",
-        "trigger/error", "trigger/periodic", "trigger/switching", "values", "vectors",
+        "estimate", "frames", "law/base", "law/starling", "prediction", "safety/avoidance",
+        "safety/filter", "trigger/base", "trigger/error", "trigger/periodic", "trigger/switching", "values", "vectors",
     )),
     *(
         path.relative_to(ROOT).as_posix()

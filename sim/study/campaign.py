@@ -22,7 +22,8 @@ from companion.errors import ConfigError
 from companion.wire.mavlink import ON_GROUND
 from companion.wire.px4 import Px4Mode
 from sim.autopilot.faults import Fault, FaultKind
-from sim.lockstep.lockstep import Lockstep, Vehicle
+from sim.lockstep.clockwork import Vehicle
+from sim.lockstep.lockstep import Lockstep
 from sim.lockstep.network import NetworkParameters
 from sim.study.attacks import PLANS, STATES, forged_plan, forged_state
 from sim.study.common import FLYING_CODE, Column, Config, Outcome, Record, Table, load_config, proportion_text, table_of

@@ -20,7 +20,7 @@ from companion.core.law.evasion import FLEES, Threat
 from companion.core.safety.filter import COLLISION_DISTANCE_M as COLLISION_M
 from sim.study.common import Column, Config, Figure, Floats, Outcome, Record, Table, fewer_percent, table_of
 from sim.study.figures import BLUE, FAMILY, GREY, RED, panels
-from sim.swarm.setup import linked_pairs
+from sim.swarm.options import linked_pairs
 from sim.swarm.swarm import Run, run
 
 TITLE = "Evasion"

@@ -9,7 +9,8 @@ import numpy as np
 from sim.study.common import Column, Config, Figure, Outcome, Record, Table, statistics
 from sim.study.figures import FAMILY, GREY, RED, panels, quartiles
 from sim.swarm.neighbour_list import NeighbourList
-from sim.swarm.setup import Setup, rules_of, run_options
+from sim.swarm.options import rules_of, run_options
+from sim.swarm.setup import Setup
 from sim.swarm.swarm import kernels, reference_table, run, starts, state_of, with_list
 
 TITLE = "Scale: what a step costs, how long a swarm takes to form"
@@ -29,6 +30,7 @@ def step_costs(setup: Setup, seed: int, steps: int, relative_speed_m_s: float) -
     """
     loops = kernels()
     from sim.swarm import exchange
+    from sim.swarm.command import command
 
     n = setup.formation.count
     plain, filtered = (run_options(replace(setup, barrier=b)) for b in (False, True))
@@ -55,9 +57,9 @@ def step_costs(setup: Setup, seed: int, steps: int, relative_speed_m_s: float) -
         exchange.send(k, k, s, table, plain, et, st, it, ig)
         exchange.predict_all(k, s, table, plain, ig)
         law = time.thread_time_ns()
-        loops.command(k, s, table, plain, g, ig)
+        command(k, s, table, plain, g, ig)
         middle = time.thread_time_ns()
-        loops.command(k, s, table, filtered, g, ig)
+        command(k, s, table, filtered, g, ig)
         end = time.thread_time_ns()
         s.x[:] += setup.dt_s * s.v
         if k == 4:

@@ -16,8 +16,8 @@ from companion.core import prediction as hold
 from companion.core.law import consensus, evasion, intent, paper
 from companion.core.law import starling as law
 from companion.core.neighbours import gates
+from companion.core.safety import avoidance, program
 from companion.core.safety import filter as safety
-from companion.core.safety import program
 from companion.core.trigger import error, near, periodic, switching
 from sim.swarm import baselines
 from sim.swarm.state import Floats
@@ -25,8 +25,8 @@ from sim.swarm.state import Floats
 F = TypeVar("F", bound=Callable[..., Any])
 
 _MODULES = (
-    baselines, consensus, error, estimate, evasion, gates, hold, intent, law, law_tables, near, paper, periodic,
-    program, safety, switching, values, vectors,
+    avoidance, baselines, consensus, error, estimate, evasion, gates, hold, intent, law, law_tables, near, paper,
+    periodic, program, safety, switching, values, vectors,
 )  # fmt: skip
 
 
@@ -107,9 +107,9 @@ on_edge = compiled(program.on_edge)
 best = compiled(program.best, on_edge=on_edge)
 give_way = compiled(program.give_way, best=best)
 solve = compiled(program.solve, best=best, give_way=give_way)
-sidestep = compiled(safety.sidestep)
-avoid: Callable[[float, float, float, float, Floats, int, int, float, Floats], safety.Avoidance] = compiled(
-    cast(Any, safety.avoid), sidestep=sidestep, solve=solve
+sidestep = compiled(avoidance.sidestep)
+avoid: Callable[[float, float, float, float, Floats, int, int, float, Floats], avoidance.Avoidance] = compiled(
+    cast(Any, avoidance.avoid), sidestep=sidestep, solve=solve
 )
 is_outlier = compiled(gates.is_outlier)
 saturated = compiled(consensus.saturated)

@@ -15,8 +15,9 @@ from companion.core.trajectory.fleet import Reference
 from companion.core.values import Neighbour, VehicleState
 from companion.errors import ConfigError
 from companion.vehicle.guest import GUESTS, LAW_NOT_FINITE, LAW_RAISED, GuestLaw
+from sim.swarm.command import keep_apart, look
 from sim.swarm.compiled import kernel
-from sim.swarm.kernels import exchange, fly, keep_apart, look
+from sim.swarm.kernels import exchange, fly
 from sim.swarm.state import TOLD, Floats, Options, State
 
 ALTITUDE_PER_S, CLIMB_PER_S = 1.0, 4.0
@@ -79,7 +80,7 @@ class PlainLaws:
 
 @kernel
 def known(i: int, k: int, s: State, ref: Floats, o: Options) -> int:
-    """`kernels.look` of agent i, whose common velocity is the plan's."""
+    """`command.look` of agent i, whose common velocity is the plan's."""
     m = i if ref.shape[1] > 1 else 0
     return look(i, k, s.measured[i], Ned(ref[k, m, 3], ref[k, m, 4], ref[k, m, 5]), s, ref, o)
 
@@ -88,7 +89,7 @@ def known(i: int, k: int, s: State, ref: Floats, o: Options) -> int:
 def command(
     i: int, k: int, count: int, u0: float, u1: float, u2: float, s: State, ref: Floats, o: Options
 ) -> None:  # fmt: skip
-    """`kernels.keep_apart` of agent i, whose slot accelerates as the plan says."""
+    """`command.keep_apart` of agent i, whose slot accelerates as the plan says."""
     m = i if ref.shape[1] > 1 else 0
     velocity = Ned(ref[k, m, 3], ref[k, m, 4], ref[k, m, 5])
     keep_apart(i, count, u0, u1, u2, k, velocity, Ned(ref[k, m, 6], ref[k, m, 7], ref[k, m, 8]), s, o)

@@ -8,7 +8,7 @@ import numpy as np
 from companion.core.frames import Ned
 from companion.core.law.base import Wanted
 from companion.core.law.starling import Gains, Sums
-from companion.core.safety import filter as safety
+from companion.core.safety.avoidance import Avoidance
 from companion.core.trajectory.fleet import Reference
 from companion.core.trigger.near import PUSH_M_S2
 from companion.core.values import Neighbour, VehicleState
@@ -56,8 +56,8 @@ def sums_over(ego: VehicleState, slot_velocity: Ned, rows: Floats, count: int, a
 def constrain(
     u_north: float, u_east: float, ego: VehicleState, shared: Ned, rows: Floats, count: int, most: float,
     planes: Floats, spare: Floats,
-) -> safety.Avoidance:  # fmt: skip
-    """What `safety.SafetyFilter` makes of a command for the sake of the first `count` rows; see `safety.half_plane`."""
+) -> Avoidance:  # fmt: skip
+    """What the safety filter makes of a command for the sake of the first `count` rows; see `core.safety.filter`."""
     peers = 0
     for k in range(count):
         n = neighbour(rows, k)

@@ -21,7 +21,8 @@ from companion.core.law.evasion import NO_THREAT, UNDISTURBED
 from companion.errors import ConfigError
 from companion.vehicle.publisher import CLOCK_SHIFT_NS
 from sim.swarm.neighbour_list import NeighbourList
-from sim.swarm.setup import DENSE_MAX, Setup, connected, linked_pairs, near_uncertainty_m, rules_of, run_options
+from sim.swarm.options import linked_pairs, near_uncertainty_m, rules_of, run_options
+from sim.swarm.setup import DENSE_MAX, Setup, connected
 from sim.swarm.state import CAUSES, ERROR_BIN_M, ERROR_BINS, MEASURES, ROW, SAMPLE, Floats, Ints, State
 
 

@@ -19,7 +19,9 @@ from companion.core.monitor import PeerMotion
 from companion.core.trigger.base import Situation
 from companion.core.trigger.periodic import PeriodicTrigger
 from companion.core.values import Phase
-from sim.lockstep.lockstep import UTC_AT_START_NS, BoundCount, Lockstep
+from sim.lockstep.bound_count import BoundCount
+from sim.lockstep.clockwork import UTC_AT_START_NS
+from sim.lockstep.lockstep import Lockstep
 
 ROOT = Path(__file__).resolve().parents[2]
 STRAIGHT_S, AFTER_S = 25.0, 40.0

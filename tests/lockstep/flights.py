@@ -17,7 +17,8 @@ from companion.core.trajectory.history import TrajectoryHistory
 from companion.core.values import Instant, Phase
 from companion.io.recording import Entry
 from companion.wire.operator import encode
-from sim.lockstep.lockstep import UTC_AT_START_NS, Lockstep
+from sim.lockstep.clockwork import UTC_AT_START_NS
+from sim.lockstep.lockstep import Lockstep
 from sim.lockstep.network import NetworkParameters
 
 DEFAULT = Path(__file__).resolve().parents[2] / "fleet.toml"

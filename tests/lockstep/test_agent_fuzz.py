@@ -24,7 +24,8 @@ from companion.errors import WireError
 from companion.vehicle.agent import Agent
 from companion.wire.operator import encode
 from companion.wire.peer import VERSION, decode_motion, decode_state, encode_motion, encode_state
-from sim.lockstep.lockstep import UTC_AT_START_NS, Lockstep
+from sim.lockstep.clockwork import UTC_AT_START_NS
+from sim.lockstep.lockstep import Lockstep
 
 pytestmark = pytest.mark.timeout(600)
 """a flight is simulated within a test, on whatever machine"""

@@ -16,7 +16,8 @@ from companion.core.values import FLYING_PHASES, Instant, Phase
 from companion.wire.mavlink import ON_GROUND
 from companion.wire.px4 import Px4Mode
 from sim.autopilot.faults import Fault, FaultKind
-from sim.lockstep.lockstep import UTC_AT_START_NS, Lockstep
+from sim.lockstep.clockwork import UTC_AT_START_NS
+from sim.lockstep.lockstep import Lockstep
 from sim.study.campaign import ESTIMATE_FAULTS
 
 pytestmark = pytest.mark.timeout(600)

@@ -4,7 +4,8 @@ import pytest
 from flights import fleet, launch, straight, until, wait
 
 from companion.core.values import Phase
-from sim.lockstep.lockstep import BoundCount, Lockstep
+from sim.lockstep.bound_count import BoundCount
+from sim.lockstep.lockstep import Lockstep
 from sim.lockstep.network import NetworkParameters
 
 LEGS = [*straight(4.0), {"kind": "turn", "rate_deg_s": 6.0, "angle_deg": 90.0}]

@@ -31,7 +31,8 @@ from companion.wire.operator import Status, decode, encode
 from companion.wire.peer import decode_motion, encode_motion
 from sim.launch.summary.flight import Flight, Put
 from sim.launch.summary.summarise import summarise
-from sim.lockstep.lockstep import UTC_AT_START_NS, Lockstep
+from sim.lockstep.clockwork import UTC_AT_START_NS
+from sim.lockstep.lockstep import Lockstep
 from sim.lockstep.network import NetworkParameters
 
 pytestmark = pytest.mark.timeout(600)

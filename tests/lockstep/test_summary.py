@@ -24,7 +24,8 @@ from companion.wire.px4 import Px4Mode
 from sim.autopilot.faults import Fault, FaultKind
 from sim.launch.summary.flight import Flight
 from sim.launch.summary.summarise import summarise
-from sim.lockstep.lockstep import UTC_AT_START_NS, Lockstep
+from sim.lockstep.clockwork import UTC_AT_START_NS
+from sim.lockstep.lockstep import Lockstep
 
 ON_GROUND = 1
 COUNT = 3

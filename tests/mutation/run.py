@@ -28,6 +28,7 @@ EXPLAINED = Path(__file__).with_name("survivors.toml")
 _PROGRAM, _SAFETY, _FENCE, _NEAR = (f"tests/unit/test_{x}.py" for x in ("program", "safety", "fence", "near"))
 SOURCES = {
     "companion/core/safety/filter.py": (_SAFETY, _FENCE, _PROGRAM),
+    "companion/core/safety/avoidance.py": (_PROGRAM, _SAFETY, _FENCE),
     "companion/core/safety/program.py": (_PROGRAM, _SAFETY, _FENCE),
     "companion/core/trigger/near.py": (_NEAR,),
     "companion/core/phase.py": ("tests/unit/test_phase.py",),

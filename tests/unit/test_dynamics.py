@@ -13,7 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sim.autopilot.disturbances import GustParameters, NoiseParameters, OrnsteinUhlenbeck, normals
-from sim.autopilot.dynamics import HOLD_STILL, DynamicsParameters, Setpoint, Vehicle, constrain_horizontal
+from sim.autopilot.dynamics import Vehicle, constrain_horizontal
+from sim.autopilot.dynamics_parameters import DynamicsParameters
+from sim.autopilot.setpoint import HOLD_STILL, Setpoint
 
 DT_S = 0.004
 GOLDEN = Path(__file__).parents[1] / "golden"

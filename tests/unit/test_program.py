@@ -13,8 +13,9 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from companion.core.frames import Ned
+from companion.core.safety.avoidance import sidestep
 from companion.core.safety.fence import Fence, braking_pole_per_s, wall_plane
-from companion.core.safety.filter import SafetyFilter, SafetyLimits, half_plane, sidestep
+from companion.core.safety.filter import SafetyFilter, SafetyLimits, half_plane
 from companion.core.safety.program import FLAT, Solution, solve
 from companion.core.values import Command, Neighbour, VehicleState
 

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from companion.core.counts import OTHER
 from companion.core.frames import Ned
+from companion.core.safety.avoidance import sidestep
 from companion.core.safety.filter import (
     COLLISION_DISTANCE_M,
     DOWNWASH_RATIO,
@@ -25,7 +26,6 @@ from companion.core.safety.filter import (
     nearest_hypothesis,
     out_of_reach,
     safety_radius_m,
-    sidestep,
 )
 from companion.core.safety.program import solve
 from companion.core.values import Command, Neighbour, SafeSetpoint, VehicleState

@@ -9,7 +9,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SOURCE = " ".join(
     " ".join(
         (ROOT / "companion" / "core" / name).read_text(encoding="utf-8")
-        for name in ("safety/filter.py", "safety/program.py", "trigger/near.py", "phase.py")
+        for name in ("safety/filter.py", "safety/avoidance.py", "safety/program.py", "trigger/near.py", "phase.py")
     ).split()
 )
 GROUPS = tomllib.loads((ROOT / "tests" / "mutation" / "survivors.toml").read_text(encoding="utf-8"))["group"]

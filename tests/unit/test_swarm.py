@@ -21,6 +21,7 @@ from companion.core.law.intent import IntentGains, response
 from companion.core.law.paper import paper_gains
 from companion.core.neighbours.sample import predict_sample
 from companion.core.prediction import HoldKind, PlainHold
+from companion.core.safety import avoidance
 from companion.core.safety import filter as safety
 from companion.core.trajectory.fleet import Reference
 from companion.core.trigger.base import Situation
@@ -32,9 +33,10 @@ from companion.errors import ConfigError
 from sim.swarm import compiled as core
 from sim.swarm.exchange import hold_weights
 from sim.swarm.neighbour_list import NeighbourList
+from sim.swarm.options import rules_of, run_options
 from sim.swarm.plain_law import PlainLaws
 from sim.swarm.rows import CompiledLaw, as_rows, constrain
-from sim.swarm.setup import Formation, Setup, rules_of, run_options, setup_from
+from sim.swarm.setup import Formation, Setup, setup_from
 from sim.swarm.state import HOLD_DAMPED, HOLD_FIRST, HOLD_ZERO
 from sim.swarm.swarm import kernels, reference_table, run, starts, state_of
 
@@ -132,7 +134,7 @@ def test_the_walls_of_a_program_are_flown_as_they_are_compiled(states: int) -> N
         rows = np.hstack([rng.normal(size=(count, 2)), rng.normal(0.0, 4.0, (count, 3))]).tolist()
         u, v = rng.uniform(-5.6, 5.6, 2).tolist(), rng.normal(0.0, 1.5, 2).tolist()
         compiled = core.avoid(*u, *v, np.array(rows), peers, count, most, np.zeros((count, 3)))
-        flown = safety.avoid(*u, *v, rows, peers, count, most, [[0.0] * 3 for _ in rows])
+        flown = avoidance.avoid(*u, *v, rows, peers, count, most, [[0.0] * 3 for _ in rows])
         assert (compiled.peer, compiled.wall) == (flown.peer, flown.wall)
         assert compiled[4:] == pytest.approx(flown[4:], abs=1e-6)
         apart.append(math.dist(compiled[:2], flown[:2]))
@@ -212,7 +214,7 @@ def test_the_swarms_command_is_the_laws_and_the_filters_of_what_each_agent_has_p
             rows = [list(h[:3]) + list(h[4:]) for n in around for h in [safety.half_plane(ego, plan[2], n)]]
             room = [[0.0] * 3 for _ in rows]
             v = ego.velocity_ned_m_s
-            kept = safety.avoid(*wanted[:2], v.north, v.east, rows, len(rows), len(rows), 8.0, room)
+            kept = avoidance.avoid(*wanted[:2], v.north, v.east, rows, len(rows), len(rows), 8.0, room)
             assert s.u[i] == pytest.approx((kept.north, kept.east, wanted.down), abs=1e-6)
             filtered += kept.peer
     assert filtered > 20

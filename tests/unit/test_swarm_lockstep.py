@@ -11,7 +11,8 @@ pytest.importorskip("numba")
 
 from companion.config import load
 from companion.core.values import Phase
-from sim.lockstep.lockstep import UTC_AT_START_NS, Lockstep
+from sim.lockstep.clockwork import UTC_AT_START_NS
+from sim.lockstep.lockstep import Lockstep
 from sim.swarm.setup import Formation, Setup
 from sim.swarm.swarm import Run, run
 

@@ -14,7 +14,8 @@ from companion.core.trigger import near
 from companion.core.values import Neighbour
 from companion.errors import ConfigError
 from sim.swarm import compiled as core
-from sim.swarm.setup import Formation, Setup, linked_pairs, near_uncertainty_m, setup_from
+from sim.swarm.options import linked_pairs, near_uncertainty_m
+from sim.swarm.setup import Formation, Setup, setup_from
 from sim.swarm.state import CAUSES
 from sim.swarm.swarm import motion_table, quantile_m, run
 

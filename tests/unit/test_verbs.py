@@ -114,6 +114,16 @@ def test_a_kill_that_nobody_confirms_commands_nobody() -> None:
     assert "Traceback" not in done.stderr
 
 
+def test_a_replay_without_its_library_says_which_extra_to_install() -> None:
+    done = python(
+        "import sys; sys.modules['mcap'] = None; import companion.__main__ as m; m.main()", "replay", "x.mcap"
+    )
+    assert done.returncode == 2
+    assert done.stderr == (
+        "companion: this command needs mcap, which is not installed: pip install 'starling-fleet[replay]'\n"
+    )
+
+
 def test_a_command_whose_libraries_are_missing_says_what_to_install_and_that_verbs_need_none_of_it() -> None:
     done = python("import sys; sys.modules['tomli_w'] = None; import sim.__main__ as m; m.main()", "up")
     assert done.returncode == 2, done.stderr

@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import development as mavlink
 from companion.core.frames import Geodetic, Ned
 from sim.autopilot.autopilot import Autopilot
 from sim.autopilot.disturbances import GustParameters, NoiseParameters
-from sim.autopilot.dynamics import DynamicsParameters
+from sim.autopilot.dynamics_parameters import DynamicsParameters
 from sim.autopilot.modes import Mode
 
 ORIGIN = Geodetic(47.3977415, 8.5455929, 489.69)

@@ -4,7 +4,7 @@ import pytest
 from autopilot_flight import Flight, mavlink
 
 from sim.autopilot.disturbances import GustParameters, NoiseParameters
-from sim.autopilot.dynamics import DynamicsParameters
+from sim.autopilot.dynamics_parameters import DynamicsParameters
 from sim.autopilot.modes import LandedState, Mode
 
 

@@ -17,7 +17,7 @@ from autopilot_flight import (
 )
 
 from companion.core.frames import Ned
-from sim.autopilot.dynamics import DynamicsParameters
+from sim.autopilot.dynamics_parameters import DynamicsParameters
 from sim.autopilot.modes import Mode, OffboardLossAction
 from sim.autopilot.offboard import decode_setpoint
 

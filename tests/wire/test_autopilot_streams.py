@@ -17,7 +17,7 @@ from autopilot_flight import UTC_OFFSET_NS, Flight, mavlink
 
 from companion.core.frames import Geodetic, Ned, geodetic_to_ned, ned_to_geodetic
 from sim.autopilot.disturbances import GustParameters, NoiseParameters
-from sim.autopilot.dynamics import DynamicsParameters
+from sim.autopilot.dynamics_parameters import DynamicsParameters
 from sim.autopilot.modes import Mode
 from sim.autopilot.streams import STREAMS
 from sim.autopilot.telemetry import Projection, to_body

@@ -14,13 +14,13 @@ pair whose filters are both active each takes half; toward anybody else this veh
 2 |x|, so that g is the part of the direction from the peer that is level, b an acceleration of the distance, and what
 is missing the acceleration at which the distance falls short: so a near peer's is compared with a far one's, and with a
 wall's, where not all can be kept. The command nearest to the law's that satisfies every half-plane and the acceleration
-limit is a small program, solved exactly in `core.safety.program`.
+limit is flown (`core.safety.avoidance`): a small program, solved exactly in `core.safety.program`.
 
 The fence's walls are half-planes of the same kind (`core.safety.fence`). Altitude is limited where it is flown: the
 position sent stays between floor and ceiling, and the velocity sent ends there.
 """
 
-from collections.abc import MutableSequence, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import copysign, hypot, isfinite, sqrt
 from typing import NamedTuple
@@ -28,8 +28,8 @@ from typing import NamedTuple
 from companion.core.counts import Counts
 from companion.core.estimate import VelocityReference
 from companion.core.frames import Ned
+from companion.core.safety.avoidance import avoid
 from companion.core.safety.fence import Fence, braking_pole_per_s, wall_plane
-from companion.core.safety.program import FLAT, solve
 from companion.core.values import Command, Neighbour, SafeSetpoint, VehicleState
 from companion.core.vectors import closest_point_parameter, lerp
 
@@ -40,8 +40,6 @@ COLLISION_DISTANCE_M = 0.5
 LAG_ALLOWANCE_M = 0.15
 SPEED_APPROACH_PER_S = 2.0
 """how fast the speed may approach its limit: acceleration along the velocity per what is left"""
-SIDESTEP_SPEED_M_S = 0.6
-"""speed along the obstacle at which a blocked vehicle passes it, on its right"""
 BIAS_MAX_M_S = 1.0
 """most of the estimator's velocity bias, per axis, that is put back into what is sent: PX4's is 0.15-0.25 m/s. It is
 added after the speed limit, so that no more than speed_max + 1.42 m/s is ever sent"""
@@ -84,20 +82,6 @@ class HalfPlane(NamedTuple):
     v_north: float = 0.0
     """velocity of the obstacle (m/s)"""
     v_east: float = 0.0
-
-
-class Avoidance(NamedTuple):
-    """What becomes of a wanted command."""
-
-    north: float
-    east: float
-    peer: bool
-    """it came too near to a peer"""
-    wall: bool
-    """it came too near to a wall"""
-    peers_missed_m_s2: float
-    """by how much not even this command keeps the peers' half-planes"""
-    walls_missed_m_s2: float
 
 
 def safety_radius_m(neighbour_uncertainty_m: float) -> float:
@@ -208,49 +192,6 @@ def resting_push_m_s2(distance_m: float, radius_m: float) -> float:
 def push_m_s2(plane: HalfPlane) -> float:
     """The push toward the peer that would just break its half-plane, -b/|g| (m/s^2); negative: it is broken at rest."""
     return -plane.b / max(hypot(plane.g_north, plane.g_east), 1e-6)
-
-
-def avoid(
-    u_north: float, u_east: float, v_north: float, v_east: float, rows: Sequence[MutableSequence[float]], peers: int,
-    count: int, most: float, spare: Sequence[MutableSequence[float]],
-) -> Avoidance:  # fmt: skip
-    """The command nearest to u, |u| <= `most`, that keeps what the rows say, at the own velocity v (m/s).
-
-    Rows are those of half-planes, `peers` of peers before those of walls, `count` in all; they and `spare`, room for as
-    many, are used up. Where it is a peer that blocks u, u is moved along it first.
-    """
-    blocking, worst, wall = -1, 0.0, False
-    for k in range(count):
-        missing = rows[k][2] - rows[k][0] * u_north - rows[k][1] * u_east
-        if missing > 0.0 and k >= peers:
-            wall = True
-        elif missing > 0.0:
-            missing = missing / max(hypot(rows[k][0], rows[k][1]), FLAT)
-            if missing > worst:
-                blocking, worst = k, missing
-    peer = blocking >= 0
-    if not peer and not wall:
-        return Avoidance(u_north, u_east, False, False, 0.0, 0.0)
-    if peer:
-        row = rows[blocking]
-        u_north, u_east = sidestep(u_north, u_east, row[0], row[1], v_north - row[3], v_east - row[4])
-    s = solve(u_north, u_east, rows, peers, count, most, spare)
-    return Avoidance(s.north, s.east, peer, wall, s.peers_missed, s.others_missed)
-
-
-def sidestep(
-    u_north: float, u_east: float, g_north: float, g_east: float, v_north: float, v_east: float
-) -> tuple[float, float]:
-    """u with what moves it to the right along the plane that it violates most; v is the velocity relative to the
-    obstacle (m/s). A command that does not press against the obstacle stays as it is: without this, head-on pairs stop
-    for ever."""
-    size = max(hypot(g_north, g_east), FLAT)
-    n_north, n_east = g_north / size, g_east / size
-    pressing = -(u_north * n_north + u_east * n_east)
-    right_north, right_east = n_east, -n_north
-    sideways = v_north * right_north + v_east * right_east
-    push = min(max(pressing, 0.0), 1.0) * 1.5 * max(SIDESTEP_SPEED_M_S - sideways, 0.0)
-    return u_north + push * right_north, u_east + push * right_east
 
 
 ACTING = (

@@ -26,7 +26,7 @@ from typing import Any, Final, Literal, assert_never
 import zenoh
 
 from companion.config import FleetConfig
-from companion.config.derived import KEEP_ALIVES, notice_lost_s
+from companion.config.bounds import KEEP_ALIVES, notice_lost_s
 from companion.errors import ConfigError
 from companion.io.transport import PAYLOAD_MAX_BYTES, PLAN_TOPIC, REQUEST_KINDS, STATE_TOPIC, VEHICLE_ID_MAX
 
