@@ -36,6 +36,7 @@ from sim.swarm.state import (
     HOLD_DAMPED,
     HOLD_FIRST,
     HOLD_OBSERVER,
+    HOLD_RETURNING,
     HOLD_ZERO,
     INTENT,
     PERIODIC,
@@ -105,7 +106,7 @@ class Formation:
 
 
 COMPILED_LAWS = ("flown", "intent")
-Hold = Literal["zero", "first", "damped", "observer"]
+Hold = Literal["zero", "first", "damped", "returning", "observer"]
 Trigger = Literal["error", "switching", "periodic", "float clock", "classic", "elastic", "intent"]
 Reading = Literal["V0", "V1", "V1b", "V2"]
 Separation = Literal["cut", "gradient", "uncut", "attracting"]
@@ -421,7 +422,8 @@ def near_uncertainty_m(setup: Setup) -> Floats:
 
 
 _HOLDS: Mapping[Hold, int] = {
-    "zero": HOLD_ZERO, "first": HOLD_FIRST, "damped": HOLD_DAMPED, "observer": HOLD_OBSERVER
+    "zero": HOLD_ZERO, "first": HOLD_FIRST, "damped": HOLD_DAMPED, "returning": HOLD_RETURNING,
+    "observer": HOLD_OBSERVER,
 }  # fmt: skip
 _TRIGGERS: Mapping[Trigger, int] = {
     "error": ERROR, "switching": SWITCHING, "periodic": PERIODIC, "float clock": FLOAT_CLOCK, "classic": CLASSIC,
@@ -450,6 +452,9 @@ def run_options(setup: Setup) -> Options:
         every=setup.control_every,
         hold=_HOLDS[setup.hold],
         damping=setup.damping_s,
+        hold_k_v=setup.k_v,
+        hold_k_p=setup.k_p,
+        hold_saturation=setup.saturation_m,
         trigger=_TRIGGERS[setup.trigger],
         t_min=setup.t_min_s,
         t_max=setup.t_max_s,
