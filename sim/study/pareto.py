@@ -186,7 +186,8 @@ FAMILIES = (
 SHOWN_AS = {
     "Eq. (2)": "Eq. (2), zero order", "nothing": "nothing received", "heartbeats": "heartbeats only",
     "same number": "periodic, same number", "raw": "20 Hz, raw state", "Hz": "periodic", "intent": "published intent",
-    "flown": "flown law", "returning": "returning hold, other ε", "damped": "damped hold", "first": "first-order hold", "zero": "zero-order hold",
+    "flown": "flown law", "returning": "returning hold, other ε", "damped": "damped hold", "first": "first-order hold",
+    "zero": "zero-order hold",
 }  # fmt: skip
 
 

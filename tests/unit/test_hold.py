@@ -154,9 +154,7 @@ def test_what_is_beyond_the_saturation_stays_and_the_direction_is_kept(
 
 @PROPERTY
 @given(vectors, velocities, st.floats(0.0, 30.0))
-def test_where_no_motion_is_shared_and_along_the_vertical_it_is_the_damped_one(
-    p: Ned, v: Ned, tau_s: float
-) -> None:
+def test_where_no_motion_is_shared_and_along_the_vertical_it_is_the_damped_one(p: Ned, v: Ned, tau_s: float) -> None:
     plain = PlainHold("damped", 0.7)
     hold, free = ReturningHold(1.0, 0.3, 1.0, plain), PLACE._replace(shared=False)
     assert hold.at(state(p, v), (ZERO, ZERO), free, tau_s) == plain.at(state(p, v), (ZERO, ZERO), free, tau_s)

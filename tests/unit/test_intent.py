@@ -1,7 +1,7 @@
 """Published intent as it is flown: the intended place, its hold, and what the peers make of it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from math import exp, hypot, sqrt
 from pathlib import Path
 from random import Random
