@@ -10,13 +10,17 @@ from companion.core.law.base import Law
 from companion.core.law.intent import IntentGains, IntentHold, IntentLaw
 from companion.core.law.paper import paper_gains
 from companion.core.law.starling import Gains, StarlingLaw
-from companion.core.prediction import Hold, HoldKind, PlainHold
+from companion.core.prediction import Hold, PlainHold, PlainKind, ReturningHold
+
+HoldKind = Literal["returning", PlainKind]
+SATURATION_M, SATURATION_M_S = 1.0, 1.0
+"""of the starling law's errors in place and velocity"""
 
 
 class LawTable(KindTable):
     """What every law says: the rest of the vehicle reckons with it, whatever the law does."""
 
-    hold: HoldKind = "damped"
+    hold: PlainKind = "damped"
     hold_damping_s: Annotated[float, Field(ge=0.05, le=10, allow_inf_nan=False)] = 0.7
     """shorter, a prediction forgets velocity within a tick or two; longer, it runs away with it"""
     a_max_m_s2: Annotated[float, Field(ge=2, le=20, allow_inf_nan=False)] = 5.0
@@ -38,6 +42,7 @@ class StarlingTable(LawTable):
     """The default law."""
 
     kind: Literal["starling"] = "starling"
+    hold: HoldKind = "returning"  # type: ignore[assignment]  # one kind more than the others have
     k_s: Gain = 3.0
     k_a: Gain = 3.0
     k_c: Gain = 4.0
@@ -47,8 +52,17 @@ class StarlingTable(LawTable):
     def law(self, r0_m: float) -> Law:
         """See `LawTable`."""
         return StarlingLaw(
-            Gains(self.k_s, self.k_a, self.k_c, self.k_v, self.k_p, r0_m, self.a_max_m_s2, 1.0, 1.0, 1.0, vertical=0.0)
-        )
+            Gains(
+                self.k_s, self.k_a, self.k_c, self.k_v, self.k_p, r0_m, self.a_max_m_s2, SATURATION_M, SATURATION_M_S,
+                1.0, vertical=0.0,
+            )
+        )  # fmt: skip
+
+    def holding(self) -> Hold:
+        """See `LawTable`."""
+        if self.hold != "returning":
+            return super().holding()
+        return ReturningHold(self.k_v, self.k_p, SATURATION_M, PlainHold("damped", self.hold_damping_s))
 
 
 class PaperTable(LawTable):

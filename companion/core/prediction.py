@@ -2,10 +2,16 @@
 
 A law may have a hold of its own (`core.law.intent`), which its table makes (`config.law_tables`). The others have
 
-damped   p^ = p_k + [p_ref(t) - p_ref(t_k)] + T_d (1 - e^(-tau/T_d)) (v_k - v_d(t_k))
-         v^ = v_d(t) + e^(-tau/T_d) (v_k - v_d(t_k))                            tau = t - t_k
-zero     p^ = p_k, v^ = v_k                                                     (the paper's)
-first    p^ = p_k + tau v_k, v^ = v_k
+damped     p^ = p_k + [p_ref(t) - p_ref(t_k)] + T_d (1 - e^(-tau/T_d)) (v_k - v_d(t_k))
+           v^ = v_d(t) + e^(-tau/T_d) (v_k - v_d(t_k))                          tau = t - t_k
+returning  p^ - p_ref, v^ - v_d = free response of e'' + k_v e' + k_p e = 0
+zero       p^ = p_k, v^ = v_k                                                   (the paper's)
+first      p^ = p_k + tau v_k, v^ = v_k
+
+The plan pulls a whole formation that is off its place back with k_p and k_v, and no faster, since the neighbours are
+off with it. To predict that they stay off would resist the return: cohesion and alignment, stronger than k_p and k_v,
+hold on to where the others are thought to be. So the returning hold predicts it. What one vehicle alone is off goes
+faster, by cohesion, which a sample does not tell apart.
 
 Where no motion is shared, the sender's own estimate nu_k of the common velocity stands for v_d, and its rate a_k fades:
 
@@ -13,7 +19,7 @@ Where no motion is shared, the sender's own estimate nu_k of the common velocity
 """
 
 from dataclasses import dataclass
-from math import exp
+from math import cos, exp, hypot, sin, sqrt
 from typing import Literal, NamedTuple, Protocol
 
 from companion.core.frames import Ned, new
@@ -22,7 +28,7 @@ from companion.core.values import CommonMotion, PeerSample
 
 RATE_FADES_S = 2.0
 """T_a: how long a common velocity goes on changing as it did"""
-HoldKind = Literal["damped", "zero", "first"]
+PlainKind = Literal["damped", "zero", "first"]
 
 
 class Held(NamedTuple):
@@ -76,9 +82,13 @@ class Weights(NamedTuple):
     """seconds by which the velocity relative to the plan carries the position on"""
     velocity: float
     """the part of the velocity relative to the plan that is left"""
+    returned: float
+    """the part of the place relative to the plan's by which it has moved meanwhile"""
+    pulled: float
+    """velocity that it gains per place relative to the plan's (1/s)"""
 
 
-def weights(kind: HoldKind, tau_s: float, damping_s: float) -> Weights:
+def weights(kind: PlainKind, tau_s: float, damping_s: float) -> Weights:
     """Weights of a sample tau_s old; a sample from the future (clocks apart) counts as new."""
     tau_s = max(tau_s, 0.0)
     if kind == "damped":
@@ -89,17 +99,50 @@ def weights(kind: HoldKind, tau_s: float, damping_s: float) -> Weights:
 def damped(tau_s: float, damping_s: float) -> Weights:
     """Weights of the damped hold with time constant T_d = damping_s."""
     left = exp(-tau_s / damping_s)
-    return Weights(1.0, damping_s * (1.0 - left), left)
+    return Weights(1.0, damping_s * (1.0 - left), left, 0.0, 0.0)
 
 
 def zero() -> Weights:
     """Weights of the zero-order hold: the sample as it was."""
-    return Weights(0.0, 0.0, 1.0)
+    return Weights(0.0, 0.0, 1.0, 0.0, 0.0)
 
 
 def first(tau_s: float) -> Weights:
     """Weights of the first-order hold: the sample's own velocity goes on."""
-    return Weights(0.0, tau_s, 1.0)
+    return Weights(0.0, tau_s, 1.0, 0.0, 0.0)
+
+
+class Response(NamedTuple):
+    """e(tau) = ee e_k + ed e'_k and e'(tau) = de e_k + dd e'_k."""
+
+    ee: float
+    ed: float
+    de: float
+    dd: float
+
+
+def response(tau_s: float, k_d: float, k_p: float) -> Response:
+    """Free response of e'' + k_d e' + k_p e = 0 after tau_s."""
+    half = 0.5 * k_d
+    discriminant = half * half - k_p
+    decay = exp(-half * tau_s)
+    if discriminant > 1e-9:
+        root = sqrt(discriminant)
+        slow, fast = exp((root - half) * tau_s), exp((-root - half) * tau_s)
+        c, s = 0.5 * (slow + fast), 0.5 * (slow - fast) / root
+    elif discriminant < -1e-9:
+        root = sqrt(-discriminant)
+        c, s = decay * cos(root * tau_s), decay * sin(root * tau_s) / root
+    else:
+        c, s = decay, decay * tau_s
+    return Response(c + half * s, s, -k_p * s, c - half * s)
+
+
+def returning(tau_s: float, off_m: float, k_v: float, k_p: float, saturation_m: float) -> Weights:
+    """Weights of the returning hold, `off_m` from the plan's place: the law's pull saturates, what is beyond stays."""
+    r = response(tau_s, k_v, k_p)
+    share = min(1.0, saturation_m / max(off_m, 1e-12))
+    return Weights(1.0, r.ed, r.dd, share * (r.ee - 1.0), share * r.de)
 
 
 def axis(
@@ -107,17 +150,19 @@ def axis(
 ) -> tuple[float, float]:
     """Predicted position (m) and velocity (m/s) of one axis from the sample (p, v)."""
     relative = v - w.plan * vref_then
+    off = p - ref_then
     return (
-        p + w.plan * (ref_now - ref_then) + w.position * relative,
-        w.plan * vref_now + w.velocity * relative,
+        p + w.plan * (ref_now - ref_then) + w.position * relative + w.returned * off,
+        w.plan * vref_now + w.velocity * relative + w.pulled * off,
     )
 
 
 @dataclass(frozen=True, slots=True)
 class PlainHold:
-    """`Hold` by the kinds above, of position and velocity; the law's numbers stay what they were."""
+    """`Hold` by the kinds that know nothing of the law, of position and velocity; the law's numbers stay what they
+    were."""
 
-    kind: HoldKind
+    kind: PlainKind
     damping_s: float
 
     def at(self, sample: PeerSample, then: tuple[Ned, Ned], now: Reference, tau_s: float) -> Held:
@@ -140,6 +185,48 @@ class PlainHold:
         """The damped hold brakes what relative velocity there is, the paper's lets it stand."""
         braking = speed_max_m_s / self.damping_s if self.kind == "damped" else 0.0
         return HoldBounds(braking, speed_max_m_s if self.kind == "zero" else 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class ReturningHold:
+    """`Hold` by the law's own pull to the plan; the vertical, which is flown by position, and flight without a plan,
+    which has no place to be pulled to, are held damped."""
+
+    k_v: float
+    """the law's, 1/s"""
+    k_p: float
+    """the law's, 1/s^2"""
+    saturation_m: float
+    """norm at which the law's position error saturates"""
+    plain: PlainHold
+
+    def at(self, sample: PeerSample, then: tuple[Ned, Ned], now: Reference, tau_s: float) -> Held:
+        """See `Hold`."""
+        if not now.shared:
+            return self.plain.at(sample, then, now, tau_s)
+        p, v = sample.position_ned_m, sample.velocity_ned_m_s
+        then_p, then_v = then
+        now_p, now_v = now.position_ned_m, now.velocity_ned_m_s
+        off_m = hypot(p.north - then_p.north, p.east - then_p.east)
+        w, upright = returning(tau_s, off_m, self.k_v, self.k_p, self.saturation_m), damped(tau_s, self.plain.damping_s)
+        x, vx = axis(p.north, v.north, then_p.north, then_v.north, now_p.north, now_v.north, w)
+        y, vy = axis(p.east, v.east, then_p.east, then_v.east, now_p.east, now_v.east, w)
+        z, vz = axis(p.down, v.down, then_p.down, then_v.down, now_p.down, now_v.down, upright)
+        return new(Held, (new(Ned, (x, y, z)), new(Ned, (vx, vy, vz)), sample.told))
+
+    def told_error_m(self, foreseen: tuple[float, ...], tells: tuple[float, ...]) -> float:
+        """0."""
+        return self.plain.told_error_m(foreseen, tells)
+
+    def bounds(self, speed_max_m_s: float) -> HoldBounds:
+        """Of e'' + k_v e' + k_p e = 0 from a place within the saturation and a speed within the limit.
+
+        k_p e^2 + e'^2 and k_p e'^2 + e''^2 never grow: the first bounds the speed that the place adds, the second e''.
+        """
+        pull, speed = self.k_p * self.saturation_m, speed_max_m_s
+        braking = hypot(self.k_v * speed + pull, sqrt(self.k_p) * speed)
+        damped_too = self.plain.bounds(speed)
+        return HoldBounds(max(braking, damped_too.braking_m_s2), 0.0, sqrt(self.k_p) * self.saturation_m)
 
 
 class CommonWay(NamedTuple):

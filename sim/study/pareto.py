@@ -179,14 +179,15 @@ def _leaderless(config: Config, summary: dict[str, dict[str, Record]], outcome: 
 
 FAMILIES = (
     ("Eq. (2)", PURPLE, "X"), ("nothing", INK, "x"), ("heartbeats", INK, "+"), ("same number", SKY, "<"),
-    ("raw", RED, "v"), ("Hz", RED, "o"), ("intent", GREEN, "s"), ("flown", BLUE, "D"), ("damped", BLUE, "o"),
-    ("first", ORANGE, "^"), ("zero", GREY, "P"),
+    ("raw", RED, "v"), ("Hz", RED, "o"), ("intent", GREEN, "s"), ("flown", BLUE, "D"), ("returning", BLUE, "o"),
+    ("damped", BLUE, "*"), ("first", ORANGE, "^"), ("zero", GREY, "P"),
 )  # fmt: skip
 """part of a scheme's name, and how the figure shows it"""
 SHOWN_AS = {
     "Eq. (2)": "Eq. (2), zero order", "nothing": "nothing received", "heartbeats": "heartbeats only",
     "same number": "periodic, same number", "raw": "20 Hz, raw state", "Hz": "periodic", "intent": "published intent",
-    "flown": "flown law", "damped": "damped hold, other ε", "first": "first-order hold", "zero": "zero-order hold",
+    "flown": "flown law", "returning": "returning hold, other ε", "damped": "damped hold", "first": "first-order hold",
+    "zero": "zero-order hold",
 }  # fmt: skip
 
 

@@ -25,6 +25,7 @@ from sim.swarm.compiled import (
     observer_axis,
     period_ended,
     response,
+    returning,
     switching_exceeds,
     switching_threshold,
     zero,
@@ -38,6 +39,7 @@ from sim.swarm.state import (
     HOLD_DAMPED,
     HOLD_FIRST,
     HOLD_OBSERVER,
+    HOLD_RETURNING,
     INTENT,
     NEAR,
     NEVER,
@@ -54,11 +56,9 @@ from sim.swarm.state import (
 
 @kernel
 def hold_weights(kind: int, tau: float, damping: float) -> Weights:
-    if kind == HOLD_DAMPED:
-        return damped(tau, damping)
     if kind == HOLD_FIRST:
         return first(tau)
-    return zero()
+    return damped(tau, damping) if kind in (HOLD_DAMPED, HOLD_RETURNING) else zero()
 
 
 @kernel
@@ -69,7 +69,7 @@ def predict(
     tau = max((now - then) * o.dt, 0.0)
     m = j if ref.shape[1] > 1 else 0
     if o.intent == 1:
-        r = response(tau, ig)
+        r = response(tau, ig.k_d, ig.k_p)
         for k in range(3):
             c, rate = anchor_axis(sample[k], sample[3 + k], sample[6 + k], tau, ig.c_g)
             out[k] = slot[k] + c + r.ee * sample[9 + k] + r.ed * sample[12 + k]
@@ -84,6 +84,17 @@ def predict(
         out[0], out[3] = axis(sample[0], sample[3], 0.0, sample[6], level.north_m, out[9], w)
         out[1], out[4] = axis(sample[1], sample[4], 0.0, sample[7], level.east_m, out[10], w)
         out[2], out[5] = axis(sample[2], sample[5], 0.0, sample[8], upright.north_m, out[11], w)
+        return
+    if o.hold == HOLD_RETURNING:
+        x = sample[0] - slot[0] + ref[now, m, 0] - ref[then, m, 0]
+        y = sample[1] - slot[1] + ref[now, m, 1] - ref[then, m, 1]
+        z = sample[2] - slot[2] + ref[now, m, 2] - ref[then, m, 2]
+        w = returning(tau, math.sqrt(x * x + y * y + z * z), o.hold_k_v, o.hold_k_p, o.hold_saturation)
+        for k in range(3):
+            place = slot[k] - ref[now, m, k] + ref[then, m, k]
+            out[k], out[3 + k] = axis(
+                sample[k], sample[3 + k], place, ref[then, m, 3 + k], slot[k], ref[now, m, 3 + k], w
+            )
         return
     for k in range(3):
         out[k], out[3 + k] = axis(

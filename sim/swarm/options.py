@@ -25,6 +25,7 @@ from sim.swarm.state import (
     HOLD_DAMPED,
     HOLD_FIRST,
     HOLD_OBSERVER,
+    HOLD_RETURNING,
     HOLD_ZERO,
     INTENT,
     PERIODIC,
@@ -57,7 +58,8 @@ def near_uncertainty_m(setup: Setup) -> Floats:
 
 
 _HOLDS: Mapping[Hold, int] = {
-    "zero": HOLD_ZERO, "first": HOLD_FIRST, "damped": HOLD_DAMPED, "observer": HOLD_OBSERVER
+    "zero": HOLD_ZERO, "first": HOLD_FIRST, "damped": HOLD_DAMPED, "returning": HOLD_RETURNING,
+    "observer": HOLD_OBSERVER,
 }  # fmt: skip
 _TRIGGERS: Mapping[Trigger, int] = {
     "error": ERROR, "switching": SWITCHING, "periodic": PERIODIC, "float clock": FLOAT_CLOCK, "classic": CLASSIC,
@@ -86,6 +88,9 @@ def run_options(setup: Setup) -> Options:
         every=setup.control_every,
         hold=_HOLDS[setup.hold],
         damping=setup.damping_s,
+        hold_k_v=setup.k_v,
+        hold_k_p=setup.k_p,
+        hold_saturation=setup.saturation_m,
         trigger=_TRIGGERS[setup.trigger],
         t_min=setup.t_min_s,
         t_max=setup.t_max_s,

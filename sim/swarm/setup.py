@@ -80,7 +80,7 @@ class Formation:
 
 
 COMPILED_LAWS = ("flown", "intent")
-Hold = Literal["zero", "first", "damped", "observer"]
+Hold = Literal["zero", "first", "damped", "returning", "observer"]
 Trigger = Literal["error", "switching", "periodic", "float clock", "classic", "elastic", "intent"]
 Reading = Literal["V0", "V1", "V1b", "V2"]
 Separation = Literal["cut", "gradient", "uncut", "attracting"]

@@ -11,7 +11,7 @@ Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.uint8]
 
-HOLD_ZERO, HOLD_FIRST, HOLD_DAMPED, HOLD_OBSERVER = 0, 1, 2, 3
+HOLD_ZERO, HOLD_FIRST, HOLD_DAMPED, HOLD_OBSERVER, HOLD_RETURNING = 0, 1, 2, 3, 4
 ERROR, SWITCHING, PERIODIC, FLOAT_CLOCK, CLASSIC, ELASTIC, INTENT = 0, 1, 2, 3, 4, 5, 6
 TOLD = 15
 """floats of a sample's motion: flown law p, v, nu, nu'; published intent c, g, w, e, e'"""
@@ -39,6 +39,10 @@ class Options(NamedTuple):
     """steps per control period"""
     hold: int
     damping: float
+    hold_k_v: float
+    """of the returning hold: the law's"""
+    hold_k_p: float
+    hold_saturation: float
     trigger: int
     t_min: float
     t_max: float

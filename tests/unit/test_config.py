@@ -5,6 +5,7 @@ import math
 import re
 import tomllib
 from collections.abc import Callable, Iterator
+from math import sqrt
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from companion.config.overrides import plan_legs, resize
 from companion.core.frames import Ned
 from companion.core.law.starling import StarlingLaw
 from companion.core.monitor import own_error_m
+from companion.core.prediction import PlainHold, ReturningHold
 from companion.core.safety.fence import Fence
 from companion.core.trajectory.legs import GotoLeg, TurnLeg, VelocityLeg
 from companion.errors import ConfigError
@@ -139,7 +141,7 @@ RANGES = [
     (f"{TURN}.rate_deg_s", 61.0, "a finite number >= -60 and <= 60 deg/s"),
     (f"{TURN}.angle_deg", 5e-324, "a finite number >= 0.01 and <= 36000 deg"),
     ("law.kind", "boids", "one of starling, paper, intent"),
-    ("law.hold", "second", "'damped', 'zero' or 'first'"),
+    ("law.hold", "second", "'returning', 'damped', 'zero' or 'first'"),
     ("law.k_s", -0.1, "a finite number >= 0 and <= 100"),
     ("law.a_max_m_s2", 1e-9, "a finite number >= 2 and <= 20 m/s^2"),
     ("trigger.kind", "always", "one of error, switching, periodic"),
@@ -368,7 +370,7 @@ ACROSS = [
     (put("peers.range_m", 6.95), "$.peers.range_m", "must be at least 6.96 m", "got 6.95"),
     (put("trigger.t_min_s", 0.11), "$.trigger.t_min_s", "<= $.trigger.near_period_s = 0.1 s", "got 0.11"),
     (periodic(0.04), "$.trigger.period_s", ">= $.trigger.t_min_s = 0.05 s", "got 0.04"),
-    (periodic(60.0), "$.launch.spacing_m", "81.67 m apart (81.02 m of it since a peer is known no better with "
+    (periodic(60.0), "$.launch.spacing_m", "87.19 m apart (86.54 m of it since a peer is known no better with "
      "$.trigger.period_s = 60 s)", "got 4.00"),
     (periodic(0.6), "$.launch.spacing_m", "known no better with $.trigger.period_s = 0.6 s", "got 4.00"),
     (put(f"{VELOCITY}.north_m_s", 3.1), "$.plan.legs[0]", "<= 3 m/s (3/4 of $.limits.speed_max_m_s)", "got 3.1"),
@@ -592,11 +594,25 @@ def test_what_was_accepted_by_the_shipped_values_is_accepted() -> None:
     assert config.spacing_min_m > 1.69
 
 
-@pytest.mark.parametrize("hold", ["damped", "zero", "first"])
+BRAKES_M_S2 = {"returning": 4.0 / 0.7, "damped": 4.0 / 0.7, "zero": 0.0, "first": 0.0}
+"""by the damped hold, which is the returning one's too along the vertical and without a plan"""
+
+
+@pytest.mark.parametrize("hold", BRAKES_M_S2)
 def test_what_a_hold_leaves_out_counts_in_a_periods_bound(hold: str) -> None:
     config = parse(changed(put("law.hold", hold)), "fleet.toml")
-    assert config.peer_motion.deviation_m_s2 == pytest.approx(8.0 + (4.0 / 0.7 if hold == "damped" else 0.0))
-    assert config.peer_motion.drift_m_s == (4.0 if hold == "zero" else 0.0)
+    motion = config.peer_motion
+    assert motion.deviation_m_s2 == pytest.approx(8.0 + BRAKES_M_S2[hold])
+    assert motion.drift_m_s == (4.0 if hold == "zero" else 0.0)
+    assert motion.speed_m_s == pytest.approx(8.0 + (sqrt(0.3) if hold == "returning" else 0.0))
+
+
+def test_the_returning_hold_follows_the_laws_own_pull_and_is_no_other_laws() -> None:
+    config = parse(changed(put("law.k_v", 2.0), put("law.k_p", 0.5)), "fleet.toml")
+    assert config.law.holding() == ReturningHold(2.0, 0.5, 1.0, PlainHold("damped", 0.7))
+    tables = changed(put("law.kind", "paper"), put("law.hold", "returning"))
+    with pytest.raises(ConfigError, match=r"law.hold.*'damped', 'zero' or 'first'.*'returning'"):
+        parse(tables, "fleet.toml")
 
 
 def test_the_papers_law_is_selectable() -> None:

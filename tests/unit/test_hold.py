@@ -1,19 +1,23 @@
-"""Holds: the damped one solves its differential equation, the others are what their names say."""
+"""Holds: the damped and the returning one solve their differential equations, the others are what their names say."""
 
-from math import cos, exp, sin
+from math import cos, exp, hypot, inf, sin
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from companion.core.prediction import HoldKind, Weights, axis, damped, weights
+from companion.core.frames import Ned
+from companion.core.prediction import PlainHold, PlainKind, ReturningHold, Weights, axis, damped, returning, weights
+from companion.core.trajectory.fleet import Reference
+from companion.core.values import ZERO, PeerSample, Phase
 
 PROPERTY = settings(deadline=None, max_examples=60)
 values = st.floats(-100.0, 100.0)
 speeds = st.floats(-5.0, 5.0)
-KINDS: tuple[HoldKind, ...] = ("damped", "zero", "first")
+KINDS: tuple[PlainKind, ...] = ("damped", "zero", "first")
+gains = st.floats(0.05, 10.0)
 
 
 def reference(t: float) -> tuple[float, float, float]:
@@ -50,7 +54,7 @@ def test_zero_and_first_order_hold_ignore_the_plan(
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("tau_s", [0.0, -1e-9, -0.5, -100.0])
-def test_a_sample_from_now_or_the_future_is_taken_as_it_is(kind: HoldKind, tau_s: float) -> None:
+def test_a_sample_from_now_or_the_future_is_taken_as_it_is(kind: PlainKind, tau_s: float) -> None:
     assert axis(7.0, 2.0, 1.0, 0.5, 1.0, 0.5, weights(kind, tau_s, 0.7)) == (7.0, 2.0)
 
 
@@ -86,6 +90,73 @@ def test_holding_twice_is_holding_once(damping_s: float, first_s: float, second_
 
 
 def test_weights_of_a_known_age() -> None:
-    assert weights("damped", 0.7, 0.7) == pytest.approx(Weights(1.0, 0.7 * (1 - exp(-1)), exp(-1)))
-    assert weights("zero", 5.0, 0.7) == (0.0, 0.0, 1.0)
-    assert weights("first", 5.0, 0.7) == (0.0, 5.0, 1.0)
+    assert weights("damped", 0.7, 0.7) == pytest.approx(Weights(1.0, 0.7 * (1 - exp(-1)), exp(-1), 0.0, 0.0))
+    assert weights("zero", 5.0, 0.7) == (0.0, 0.0, 1.0, 0.0, 0.0)
+    assert weights("first", 5.0, 0.7) == (0.0, 5.0, 1.0, 0.0, 0.0)
+
+
+# -- the returning hold ------------------------------------------------------------------------------------------------
+
+
+@settings(deadline=None, max_examples=30)
+@given(values, speeds, gains, gains, st.floats(0.0, 8.0))
+@example(3.0, 1.0, 2.0, 1.0, 2.0).via("critically damped")
+def test_returning_hold_solves_its_differential_equation(
+    p: float, v: float, k_v: float, k_p: float, tau_s: float
+) -> None:
+    """p' = v and v' = a_d - k_v (v - v_d) - k_p (p - p_ref): the plan's pull, within its saturation."""
+    start = 3.0
+
+    def rate(t: float, state: np.ndarray) -> list[float]:
+        place, v_d, a_d = reference(t)
+        return [state[1], a_d - k_v * (state[1] - v_d) - k_p * (state[0] - place)]
+
+    solution = solve_ivp(rate, (start, start + tau_s), [p, v], rtol=1e-9, atol=1e-9)
+    then, now = reference(start), reference(start + tau_s)
+    held = axis(p, v, then[0], then[1], now[0], now[1], returning(tau_s, abs(p - then[0]), k_v, k_p, inf))
+    assert held == pytest.approx(tuple(solution.y[:, -1]), abs=2e-5)
+
+
+def state(p: Ned, v: Ned) -> PeerSample:
+    return PeerSample(2, 0, p, v, 0, Phase.FORMED)
+
+
+PLACE = Reference(ZERO, ZERO, ZERO, 0.0)
+vectors = st.builds(Ned, values, values, values)
+velocities = st.builds(Ned, speeds, speeds, speeds)
+
+
+@PROPERTY
+@given(vectors, velocities, gains, gains, st.floats(0.01, 5.0), st.floats(0.0, 30.0))
+def test_the_bounds_of_the_returning_hold_are_kept(
+    p: Ned, v: Ned, k_v: float, k_p: float, saturation_m: float, tau_s: float
+) -> None:
+    hold, step_s = ReturningHold(k_v, k_p, saturation_m, PlainHold("damped", 10.0)), 1e-4
+    bounds = hold.bounds(hypot(v.north, v.east))
+    a, b = (hold.at(state(p, v), (ZERO, ZERO), PLACE, t).velocity_ned_m_s for t in (tau_s, tau_s + step_s))
+    assert hypot(b.north - a.north, b.east - a.east) / step_s <= bounds.braking_m_s2 * (1.0 + 1e-6) + 1e-6
+    assert hypot(a.north, a.east) <= hypot(v.north, v.east) + bounds.gained_m_s + 1e-9
+
+
+@PROPERTY
+@given(vectors, velocities, gains, gains, st.floats(0.01, 5.0))
+def test_what_is_beyond_the_saturation_stays_and_the_direction_is_kept(
+    p: Ned, v: Ned, k_v: float, k_p: float, saturation_m: float
+) -> None:
+    """Whoever stands far off is predicted to come as much nearer as one at the saturation, straight."""
+    hold = ReturningHold(k_v, k_p, saturation_m, PlainHold("damped", 0.7))
+    held = hold.at(state(p, ZERO), (ZERO, ZERO), PLACE, 1e4).position_ned_m
+    off_m = hypot(p.north, p.east)
+    left = max(off_m - saturation_m, 0.0) / max(off_m, 1e-12)
+    assert (held.north, held.east) == pytest.approx((left * p.north, left * p.east), abs=1e-6)
+    assert held.down == p.down
+
+
+@PROPERTY
+@given(vectors, velocities, st.floats(0.0, 30.0))
+def test_where_no_motion_is_shared_and_along_the_vertical_it_is_the_damped_one(p: Ned, v: Ned, tau_s: float) -> None:
+    plain = PlainHold("damped", 0.7)
+    hold, free = ReturningHold(1.0, 0.3, 1.0, plain), PLACE._replace(shared=False)
+    assert hold.at(state(p, v), (ZERO, ZERO), free, tau_s) == plain.at(state(p, v), (ZERO, ZERO), free, tau_s)
+    ours, theirs = (h.at(state(p, v), (ZERO, ZERO), PLACE, tau_s) for h in (hold, plain))
+    assert (ours[0].down, ours[1].down) == (theirs[0].down, theirs[1].down)

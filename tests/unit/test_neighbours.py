@@ -19,7 +19,7 @@ from companion.core.neighbours.table import (
     UNCERTAINTY_GROWTH_MAX_M,
     PeerTable,
 )
-from companion.core.prediction import HoldKind, PlainHold
+from companion.core.prediction import PlainHold, PlainKind
 from companion.core.safety.filter import nearest_hypothesis
 from companion.core.trajectory.fleet import FleetTrajectory
 from companion.core.trajectory.history import TrajectoryHistory
@@ -216,14 +216,14 @@ def test_bad_hearsay_is_left_out_and_counted_and_the_rest_is_kept(changed: dict[
 
 # -- prediction ------------------------------------------------------------------------------------------------------
 
-KINDS: tuple[HoldKind, ...] = ("damped", "zero", "first")
+KINDS: tuple[PlainKind, ...] = ("damped", "zero", "first")
 displacements = st.builds(Ned, *[st.floats(-3.0, 3.0)] * 3)
 
 
 @PROPERTY
 @given(st.sampled_from(KINDS), st.sampled_from(list(Phase)), displacements, displacements, st.floats(0.0, 11.0))
 def test_receiver_predicts_what_the_sender_compares_with(
-    kind: HoldKind, phase: Phase, shift: Ned, drift: Ned, age_s: float
+    kind: PlainKind, phase: Phase, shift: Ned, drift: Ned, age_s: float
 ) -> None:
     turn = column_at_1_m_s(legs=(TurnLeg(0.1, inf),), heading_follows_turns=True)
     t = table(turn, hold=PlainHold(kind, 0.7))

@@ -17,10 +17,9 @@ from companion.config.law_tables import LawTable
 from companion.core.frames import Ned
 from companion.core.law import starling as law
 from companion.core.law.base import Wanted
-from companion.core.law.intent import IntentGains, response
 from companion.core.law.paper import paper_gains
 from companion.core.neighbours.sample import predict_sample
-from companion.core.prediction import HoldKind, PlainHold
+from companion.core.prediction import PlainHold, PlainKind, ReturningHold
 from companion.core.safety import avoidance
 from companion.core.safety import filter as safety
 from companion.core.trajectory.fleet import Reference
@@ -31,7 +30,7 @@ from companion.core.trigger.switching import SwitchingTrigger
 from companion.core.values import ZERO, Command, Neighbour, PeerSample, Phase, VehicleState
 from companion.errors import ConfigError
 from sim.swarm import compiled as core
-from sim.swarm.exchange import hold_weights
+from sim.swarm.exchange import hold_weights, predict
 from sim.swarm.neighbour_list import NeighbourList
 from sim.swarm.options import rules_of, run_options
 from sim.swarm.plain_law import PlainLaws
@@ -145,7 +144,7 @@ def test_the_walls_of_a_program_are_flown_as_they_are_compiled(states: int) -> N
 @MANY
 def test_the_prediction_that_is_flown_is_the_one_that_is_compiled(states: int) -> None:
     rng = np.random.default_rng(states)
-    kinds: list[tuple[HoldKind, int]] = [
+    kinds: list[tuple[PlainKind, int]] = [
         ("damped", HOLD_DAMPED), ("first", HOLD_FIRST), ("zero", HOLD_ZERO)
     ]  # fmt: skip
     limits, damping_s = load(FLEET).peer_limits, 0.7
@@ -160,6 +159,30 @@ def test_the_prediction_that_is_flown_is_the_one_that_is_compiled(states: int) -
         axes = zip(sample.position_ned_m, sample.velocity_ned_m_s, *then, now[0], now[1], strict=True)
         compiled = [core.axis(p, v, p0, v0, p1, v1, w) for p, v, p0, v0, p1, v1 in axes]
         assert pytest.approx(np.array(flown[:2]), rel=1e-12, abs=1e-12) == np.array(compiled).T
+
+
+@MANY
+def test_the_returning_hold_that_is_flown_is_the_one_that_is_compiled(states: int) -> None:
+    """On one level: the swarm's law acts along the vertical too, and so does its hold."""
+    rng = np.random.default_rng(states)
+    setup = Setup(hold="returning", k_v=1.0, k_p=0.3)
+    hold = ReturningHold(1.0, 0.3, setup.saturation_m, PlainHold("damped", 0.7))
+    limits = replace(load(FLEET).peer_limits, hold=hold)
+    options, ig = run_options(setup), rules_of(setup)[1]
+    out = np.zeros(12)
+    for _ in range(states):
+        ns = int(1e9 * rng.choice([0.0, 0.02, 1.0, 30.0]) * rng.random())
+        scales = (20.0, 1.0, 5.0, rng.choice([0.3, 9.0]))
+        centres, velocities, slot, off = (rng.normal(scale=x, size=(2, 3)) for x in scales)
+        sample = np.array([*(centres[0] + slot[0] + off[0]), *rng.normal(scale=1.5, size=3)])
+        sample[2], sample[5] = centres[0, 2] + slot[0, 2], velocities[0, 2]
+        table = np.hstack([centres, velocities, np.zeros((2, 3))])[:, None, :]
+        predict(out, sample, 0, 1, 0, table, centres[1] + slot[0], options._replace(dt=ns * 1e-9), ig)
+        said = PeerSample(2, 0, Ned(*sample[:3].tolist()), Ned(*sample[3:].tolist()), 0, Phase.FORMED)
+        then = Ned(*(centres[0] + slot[0]).tolist()), Ned(*velocities[0].tolist())
+        now = Reference(Ned(*(centres[1] + slot[0]).tolist()), Ned(*velocities[1].tolist()), ZERO, 0.0)
+        flown = predict_sample(said, then, now, ns, limits)
+        assert (*flown.position_ned_m, *flown.velocity_ned_m_s) == pytest.approx(out[:6], rel=1e-12, abs=1e-12)
 
 
 @MANY
@@ -268,18 +291,6 @@ def test_prediction_error_stays_below_its_bound_while_nothing_is_lost() -> None:
         assert flown.measures["bound_worst_ratio"] < 1.0
 
 
-def test_response_of_the_intent_prediction_solves_its_equation() -> None:
-    for k_p, k_d in ((5.6, 7.7), (9.0, 1.0), (4.0, 4.0)):
-        g = IntentGains(k_p, k_d, 2.0, 1.0, 1.0, 1.0)
-        e, rate = 0.3, -0.2
-        for _ in range(2000):
-            rate += 0.0005 * (-k_d * rate - k_p * e)
-            e += 0.0005 * rate
-        r = response(1.0, g)
-        assert r.ee * 0.3 - r.ed * 0.2 == pytest.approx(e, abs=2e-3)
-        assert r.de * 0.3 - r.dd * 0.2 == pytest.approx(rate, abs=2e-3)
-
-
 def test_a_peer_that_vanishes_is_left_behind_and_nobody_touches_it() -> None:
     flown = run(replace(SHORT, fault="vanish", fault_agent=1, fault_time_s=5.0, barrier=True, links=True, k_p=0.3), 3)
     assert flown.measures["minimum_distance_m"] > 0.6
@@ -292,7 +303,7 @@ def test_a_peer_that_vanishes_is_left_behind_and_nobody_touches_it() -> None:
     [
         ({"formation": {"count": 1}}, "formation.count must be at least 2"),
         ({"loss": 1.1}, "loss must be"),
-        ({"hold": "cubic"}, "must be one of zero, first, damped, observer"),
+        ({"hold": "cubic"}, "must be one of zero, first, damped, returning, observer"),
         ({"speed": 1.0}, "is not a setting"),
         ({"dt_s": float("nan")}, "dt_s must be > 0"),
         ({"formation": {"shape": "star"}}, "formation.shape must be"),

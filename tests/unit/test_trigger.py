@@ -6,7 +6,7 @@ from math import exp, inf, nextafter, sqrt
 import pytest
 
 from companion.core.monitor import PeerMotion, prediction_error_bound_m, unheard_error_m
-from companion.core.prediction import HoldKind, axis, weights
+from companion.core.prediction import PlainKind, axis, weights
 from companion.core.trigger.base import Situation, Trigger
 from companion.core.trigger.error import RAISED_MAX_M, ErrorTrigger, exceeds
 from companion.core.trigger.periodic import PeriodicTrigger
@@ -76,7 +76,7 @@ def test_switching_trigger_at_its_thresholds(error_p2: float, error_v2: float, t
 
 
 def fly(
-    seed: int, kind: HoldKind, trigger: ErrorTrigger, spacing_s: tuple[float, float], delay_ticks: int
+    seed: int, kind: PlainKind, trigger: ErrorTrigger, spacing_s: tuple[float, float], delay_ticks: int
 ) -> tuple[float, float, int]:
     """A vehicle pushed about at up to 2 m/s^2 on a plan at 1 m/s, and one receiver of its messages.
 
@@ -118,12 +118,12 @@ def fly(
     return worst_after, worst_at_receiver, messages
 
 
-KINDS: tuple[HoldKind, ...] = ("damped", "zero", "first")
+KINDS: tuple[PlainKind, ...] = ("damped", "zero", "first")
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("seed", range(3))
-def test_receiver_prediction_error_stays_below_trigger_threshold(kind: HoldKind, seed: int) -> None:
+def test_receiver_prediction_error_stays_below_trigger_threshold(kind: PlainKind, seed: int) -> None:
     trigger = ErrorTrigger(0.3, 0.1, 0.0)
     worst, at_receiver, messages = fly(seed, kind, trigger, (0.02, 10.0), 0)
     assert worst < 0.3**2

@@ -27,14 +27,14 @@ per equation, as in `law`; the swarm compiles these. A vehicle flies them by `In
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import cos, exp, hypot, sin, sqrt
+from math import exp, hypot, sqrt
 from typing import NamedTuple
 
 from companion.core.frames import Ned
 from companion.core.law.base import Wanted
 from companion.core.law.consensus import STEP_MAX_S, saturated
 from companion.core.law.starling import Gains, Sums, separation, total, within_budget
-from companion.core.prediction import Held, HoldBounds, axis, damped
+from companion.core.prediction import Held, HoldBounds, axis, damped, response
 from companion.core.trajectory.fleet import Reference
 from companion.core.values import Neighbour, PeerSample, VehicleState
 
@@ -89,32 +89,6 @@ def rest(
     return ax - g.k_d * qx - g.k_p * px, ay - g.k_d * qy - g.k_p * py, az - g.k_d * qz - g.k_p * pz
 
 
-class Response(NamedTuple):
-    """e(tau) = ee e_k + ed e'_k and e'(tau) = de e_k + dd e'_k."""
-
-    ee: float
-    ed: float
-    de: float
-    dd: float
-
-
-def response(tau_s: float, g: IntentGains) -> Response:
-    """Free response of e'' + k_d e' + k_p e = 0 after tau_s."""
-    half = 0.5 * g.k_d
-    discriminant = half * half - g.k_p
-    decay = exp(-half * tau_s)
-    if discriminant > 1e-9:
-        root = sqrt(discriminant)
-        slow, fast = exp((root - half) * tau_s), exp((-root - half) * tau_s)
-        c, s = 0.5 * (slow + fast), 0.5 * (slow - fast) / root
-    elif discriminant < -1e-9:
-        root = sqrt(-discriminant)
-        c, s = decay * cos(root * tau_s), decay * sin(root * tau_s) / root
-    else:
-        c, s = decay, decay * tau_s
-    return Response(c + half * s, s, -g.k_p * s, c - half * s)
-
-
 def anchor_axis(c: float, g: float, w: float, tau_s: float, c_g: float) -> tuple[float, float]:
     """c^ (m) and its rate (m/s) of one axis, tau_s after the message."""
     left = exp(-c_g * tau_s)
@@ -157,7 +131,7 @@ class IntentHold:
         rate = v.north - v_then.north - g_north, v.east - v_then.east - g_east
         asked = g.k_p * hypot(*e) + sqrt(g.k_d * g.k_d + g.k_p) * hypot(*rate)
         share = min(1.0, self.a_max_m_s2 / max(asked, 1e-12))
-        r, rest_share = response(tau_s, g), 1.0 - share
+        r, rest_share = response(tau_s, g.k_d, g.k_p), 1.0 - share
         ee, ed = share * r.ee + rest_share, share * r.ed + rest_share * w.position
         de, dd = share * r.de, share * r.dd + rest_share * w.velocity
         down, v_down = axis(p.down, v.down, p_then.down, v_then.down, p_now.down, v_now.down, w)

@@ -138,5 +138,5 @@ class Foresight(NamedTuple):
             v = Ned(v.north + gone.north_m_s, v.east + gone.east_m_s, v.down)
         return (
             (ZERO, Ned(v_then.north + common.north_m_s, v_then.east + common.east_m_s, v_then.down)),
-            Reference(Ned(way[0] + gone.north_m, way[1] + gone.east_m, way[2]), v, ZERO, 0.0),
+            Reference(Ned(way[0] + gone.north_m, way[1] + gone.east_m, way[2]), v, ZERO, 0.0, shared=False),
         )
