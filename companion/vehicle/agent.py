@@ -316,7 +316,7 @@ class Agent:
 
     def _publish(self, slot: Reference, residual: Ned, now: Instant) -> None:
         """Tell the peers, if the publisher finds that they must be told."""
-        since_ns, outdated = self.supervisor.formation_since_ns, self.supervisor.outdated
+        since_ns, outdated = self.supervisor.formation_since_ns, self.supervisor.flight.outdated
         common = self.agreement.told if self.phase in FORMATION_PHASES else None
         own = OwnState(self.phase, *self.observer.smoothed, slot, residual, since_ns, self.law.tell(), outdated, common)
         message = self.publisher.publish(own, now)

@@ -278,7 +278,11 @@ class PlanExchange:
             return Proposal.RETURN
         if not plan.automatic:
             return None
-        if newest.revision == 0 and phase is Phase.WAITING and (self._supervisor.forms_without or self._all_up()):
+        if (
+            newest.revision == 0
+            and phase is Phase.WAITING
+            and (self._supervisor.flight.forms_without or self._all_up())
+        ):
             return Proposal.FORM
         if newest.revision == 1 and not newest.legs and self._all_formed(now):
             return Proposal.FLY

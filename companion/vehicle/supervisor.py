@@ -103,16 +103,6 @@ class Supervisor:
         """Whether it flies by itself: the formation does not draw it."""
         return self.phase is Phase.DETACHED or self._pending.resuming
 
-    @property
-    def forms_without(self) -> bool:
-        """Whether the wait for the others is over, and those that are up form without them."""
-        return self.flight.forms_without
-
-    @property
-    def outdated(self) -> bool:
-        """Whether a peer holds a newer motion than we do."""
-        return self.flight.outdated
-
     def state(self, now: Instant) -> tuple[Ned, Ned] | None:
         """Position and velocity to steer by (fleet frame); None while there are none to trust."""
         return None if self.flight.positions.frozen else self.autopilot.state(now)

@@ -173,7 +173,7 @@ def test_what_the_configuration_chose_of_a_rows_ways_is_done() -> None:
     assert lands.run(8.0, lambda: lands.phase is Phase.LANDING)
     goes_on = airborne(fleet(peers={"missing": "continue", "wait_s": 6.0}))
     goes_on.run(8.0)
-    assert (goes_on.phase, goes_on.supervisor.forms_without) == (Phase.WAITING, True)
+    assert (goes_on.phase, goes_on.supervisor.flight.forms_without) == (Phase.WAITING, True)
     assert lands.acted == goes_on.acted == [Failsafe.MISSING]
     (event,) = (e for e in goes_on.supervisor.events if isinstance(e, FailsafeActed))
     assert event.action is Action.CONTINUE

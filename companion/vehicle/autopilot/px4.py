@@ -5,7 +5,6 @@ nothing of its validity; what a command has done shows in the next HEARTBEAT, wh
 """
 
 from collections import deque
-from dataclasses import replace
 from math import dist, inf
 
 from companion.config import FleetConfig
@@ -29,14 +28,13 @@ from companion.vehicle.autopilot.port import (
     Outcome,
     Verb,
 )
-from companion.vehicle.autopilot.px4_parameters import PARAMETERS, identity_checks, parameter_checks
+from companion.vehicle.autopilot.px4_parameters import PARAMETERS, ParameterRows, identity_checks
 from companion.vehicle.autopilot.px4_versions import same_setting
 from companion.vehicle.autopilot.requests import STREAM, Requests
 from companion.vehicle.autopilot.round_trips import RoundTrips
 from companion.wire import mavlink as wire
 from companion.wire import px4
 from companion.wire.mavlink import MavlinkCodec
-from companion.wire.operator import Check
 from companion.wire.px4 import Px4Mode, mode_name
 
 CLOCK_SAMPLES = 5
@@ -75,7 +73,6 @@ class Px4Autopilot:
 
     def __init__(self, config: FleetConfig, vehicle: Vehicle) -> None:
         self.config = config
-        self.vehicle_id = vehicle.id
         self.fleet_origin = config.origin if config.fleet.frame == "global" else None
         self.codec = MavlinkCodec(vehicle.system_id)
         self.counts = Counts(COUNTED)
@@ -113,9 +110,7 @@ class Px4Autopilot:
         self._origin_doubted = False
         self._round_trips = RoundTrips()
         self._clock_ahead_ns: deque[int] = deque(maxlen=CLOCK_SAMPLES)
-        self._read: tuple[dict[str, float | int], set[str]] = ({}, set())
-        """of which parameters `_settings` tells: those read, and those that cannot be"""
-        self._settings: tuple[Check, ...] | None = None
+        self._settings = ParameterRows(config, vehicle.id)
 
     # -- what it says --------------------------------------------------------------------------------------------------
 
@@ -378,7 +373,7 @@ class Px4Autopilot:
             heartbeat_age_s=self.heartbeat_age_s(now),
             foreign_system_id=self.codec.foreign_system_id if _within(self.foreign_ns, HEARTBEAT_S, now) else None,
             identity=identity_checks(self.kind, self.vehicle_type),
-            settings=self._parameter_rows() if is_px4 else (),
+            settings=self._settings.of(self.parameters.values, self.parameters.missing) if is_px4 else (),
             estimate=self.estimate(now),
             rc_healthy=bool(self.sensors_health & RC_RECEIVER_FLAG) and _within(self.health_ns, STATUS_S, now),
             origin=self.origin,
@@ -391,16 +386,6 @@ class Px4Autopilot:
             # The least delayed of the last messages is nearest to the truth: delay makes the autopilot seem behind.
             clock_ahead_s=max(self._clock_ahead_ns) * 1e-9 if self._clock_ahead_ns else None,
         )
-
-    def _parameter_rows(self) -> tuple[Check, ...]:
-        """Preflight's rows of the parameters, made anew when they have changed: every status looks at them."""
-        parameters = self.parameters
-        read = (parameters.values, parameters.missing)
-        if self._settings is None or read != self._read:
-            self._read = (dict(parameters.values), set(parameters.missing))
-            rows = parameter_checks(*self._read, self.config)
-            self._settings = tuple(replace(row, vehicle=self.vehicle_id) for row in rows)
-        return self._settings
 
 
 def _within(heard_ns: int | None, limit_s: float, now: Instant) -> bool:

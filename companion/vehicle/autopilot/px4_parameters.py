@@ -5,6 +5,7 @@ A companion reads parameters and never sets one.
 
 from collections.abc import Callable, Iterator, Mapping
 from collections.abc import Set as AbstractSet
+from dataclasses import replace
 from typing import NamedTuple
 
 from companion.config import FleetConfig
@@ -125,3 +126,22 @@ def parameter_checks(
         wanted = len({same_setting(name) for name in PARAMETERS})
         says = f"{len(waiting)} of {wanted} parameters not read yet"
         yield Check("parameters", wanted - len(waiting), f"= {wanted} read", False, says)
+
+
+class ParameterRows:
+    """The rows of one vehicle, made anew when a parameter has changed: every status looks at them."""
+
+    def __init__(self, config: FleetConfig, vehicle_id: int) -> None:
+        self._config = config
+        self._vehicle_id = vehicle_id
+        self._known: tuple[dict[str, float | int], set[str]] | None = None
+        """what the rows tell of: values read, and names that cannot be"""
+        self._rows: tuple[Check, ...] = ()
+
+    def of(self, values: Mapping[str, float | int], missing: AbstractSet[str]) -> tuple[Check, ...]:
+        """The rows of these parameters."""
+        if self._known != (values, missing):
+            self._known = dict(values), set(missing)
+            rows = parameter_checks(values, missing, self._config)
+            self._rows = tuple(replace(row, vehicle=self._vehicle_id) for row in rows)
+        return self._rows
