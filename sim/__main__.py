@@ -43,10 +43,12 @@ def up(
         float | None, typer.Option("--for", min=1, help="Seconds from take-off to the landing command.")
     ] = None,
     autopilot: Annotated[str, typer.Option(help="What flies: stub, px4 (SITL) or external (runs already).")] = "stub",
-    px4: Annotated[Path | None, typer.Option(help="With --autopilot px4: PX4's build folder.")] = None,
+    px4: Annotated[
+        Path | None, typer.Option(help="With --autopilot px4: its build folder, or /opt/px4; else looked for.")
+    ] = None,
     parameter: Parameters = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of gusts, noise and estimator origins.")] = 0,
-    calm: Annotated[bool, typer.Option("--calm", help="No gusts and no sensor noise.")] = False,
+    calm: Annotated[bool, typer.Option("--calm", help="No gusts, no wind and no sensor noise.")] = False,
     gcs: Annotated[
         bool, typer.Option("--gcs", help="Show the stubs to a ground station on UDP 14550 and to PX4's 3D viewer.")
     ] = False,
@@ -69,21 +71,19 @@ def up(
     from sim.launch.faults import load_scenario
     from sim.launch.launch import FlightOptions, flight_folder, fly
     from sim.launch.lock import only_flight, refuse_companions
-    from sim.launch.px4_instance import check_build, parse_parameters
+    from sim.launch.px4_build import find_build
+    from sim.launch.px4_instance import parse_parameters
     from sim.launch.view import FlightView, show_summary
 
     if autopilot not in ("stub", "px4", "external"):
         raise ConfigError(f"--autopilot must be stub, px4 or external, got {autopilot!r}")
-    if (autopilot == "px4") != (px4 is not None):
-        raise ConfigError(
-            "--autopilot px4 needs --px4 BUILD_DIR (get PX4-Autopilot v1.16 from its project, run "
-            "`make px4_sitl_default` and pass build/px4_sitl_default), and --px4 needs --autopilot px4"
-        )
+    if px4 is not None and autopilot != "px4":
+        raise ConfigError(f"--px4 needs --autopilot px4, got --autopilot {autopilot}")
     parse_parameters(parameter or ())
-    if parameter and px4 is None:
+    if parameter and autopilot != "px4":
         raise ConfigError("--parameter is for the instances of --autopilot px4")
-    if px4 is not None:
-        px4 = check_build(px4)
+    if autopilot == "px4":
+        px4 = find_build(px4)
 
     def change(tables: dict[str, Any]) -> None:
         for table, key, value in (
@@ -95,7 +95,9 @@ def up(
 
     tables = fleet_tables(fleet, vehicles, change)
     if calm:
-        tables.setdefault("stub", {}).update(position_noise_m=0.0, velocity_noise_m_s=0.0, gust_m_s2=0.0)
+        tables.setdefault("stub", {}).update(
+            position_noise_m=0.0, velocity_noise_m_s=0.0, gust_m_s2=0.0, wind_north_m_s=0.0, wind_east_m_s=0.0
+        )
     config = parse(tables, fleet.name)
     if len(config.vehicles) > CROWD_PER_CORE * len(os.sched_getaffinity(0)):
         tables.setdefault("limits", {}).setdefault("control_rate_hz", CROWD_RATE_HZ)
@@ -195,12 +197,13 @@ def sitl(
 ) -> None:
     """Run PX4 SITL instances until standard input closes: for launchers."""
     from companion.config.overrides import fleet_config
-    from sim.launch.px4_instance import check_build, parse_parameters
+    from sim.launch.px4_build import find_build
+    from sim.launch.px4_instance import parse_parameters
     from sim.launch.sitl import SitlHost, SitlSettings
 
     config = fleet_config(fleet)
     parameters = parse_parameters(parameter or ())
-    settings = SitlSettings(check_build(px4), truth.parent, truth, sys.stdin.fileno(), parameters, ready)
+    settings = SitlSettings(find_build(px4), truth.parent, truth, sys.stdin.fileno(), parameters, ready)
     SitlHost(config, settings).run(grace_s=1.5)
 
 

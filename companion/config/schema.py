@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from companion.config.law_tables import AnyLaw, StarlingTable
-from companion.config.numbers import Noise, NotNegative, Percent, Positive, Real, Table, VehicleId, Wait
+from companion.config.numbers import Noise, NotNegative, Percent, Positive, Real, Table, VehicleId, Wait, Wind
 from companion.config.trigger_tables import AnyTrigger, ErrorTable
 from companion.core.trajectory.fleet import Then
 from companion.core.trajectory_check import (
@@ -225,6 +225,9 @@ class StubTable(Table):
     gust_m_s2: NotNegative = 0.3
     lag_s: NotNegative = 0.15
     drag_per_s: NotNegative = 0.2
+    wind_north_m_s: Wind = 0.0
+    """where the air flows to; it pushes by the drag: 5 m/s at 1.0 /s, which is PX4's SIH, with 5 m/s^2"""
+    wind_east_m_s: Wind = 0.0
     origin_scatter_m: NotNegative = 5.0
     """how far each estimator's origin lies from its vehicle's pad"""
     dynamics: Literal["px4", "ideal"] = "px4"

@@ -288,8 +288,8 @@ class Vehicle:
         # Less thrust than weight also means less horizontal force at the same tilt.
         loading = 1.0 if parameters.model == "ideal" else (GRAVITY_M_S2 - down) / GRAVITY_M_S2
         v_north, v_east, v_down = self.velocity_north_m_s, self.velocity_east_m_s, self.velocity_down_m_s
-        a_north = north * loading - drag * v_north + gust_north_m_s2
-        a_east = east * loading - drag * v_east + gust_east_m_s2
+        a_north = north * loading - drag * (v_north - parameters.wind_north_m_s) + gust_north_m_s2
+        a_east = east * loading - drag * (v_east - parameters.wind_east_m_s) + gust_east_m_s2
         a_down = down - drag * v_down + gust_down_m_s2
         smooth = dt_s / (self.DERIVATIVE_FILTER_S + dt_s)
         self._slope_north += (a_north - self._slope_north) * smooth

@@ -18,7 +18,10 @@ class DynamicsParameters:
     thrust_lag_s: float = 0.07
     """time constant from commanded to flown vertical acceleration (motors), s; 0: none"""
     drag_per_s: float = 0.1
-    """linear drag: acceleration -drag·v, 1/s. PX4's SIH: 1.0 by default"""
+    """linear drag: acceleration -drag·(v - wind), 1/s. PX4's SIH: 1.0 by default"""
+    wind_north_m_s: float = 0.0
+    """steady, where the air flows to; it moves nothing without drag. PX4's SIH: SIH_WIND_N"""
+    wind_east_m_s: float = 0.0
     thrust_max_g: float = 2.0
     """largest thrust per mass, in units of gravity"""
     ideal_velocity_gain_per_s: float = 2.0
@@ -35,6 +38,8 @@ class DynamicsParameters:
             raise ValueError(f"model must be 'px4' or 'ideal', got {self.model!r}")
         for name in ("attitude_lag_s", "thrust_lag_s", "drag_per_s"):
             require(name, getattr(self, name), 0.0 <= getattr(self, name) < math.inf, ">= 0")
+        for name in ("wind_north_m_s", "wind_east_m_s"):
+            require(name, getattr(self, name), math.isfinite(getattr(self, name)), "finite")
         for name in (
             "ideal_velocity_gain_per_s",
             "ideal_position_gain_per_s",

@@ -88,7 +88,8 @@ def stub_settings(
         vehicles=tuple(vehicles),
         fleet_origin=config.origin,
         dynamics=DynamicsParameters(
-            model=stub.dynamics, attitude_lag_s=stub.lag_s, drag_per_s=stub.drag_per_s
+            model=stub.dynamics, attitude_lag_s=stub.lag_s, drag_per_s=stub.drag_per_s,
+            wind_north_m_s=stub.wind_north_m_s, wind_east_m_s=stub.wind_east_m_s,
         ),
         gust=GustParameters(sigma_m_s2=stub.gust_m_s2),
         noise=NoiseParameters(position_sigma_m=stub.position_noise_m, velocity_sigma_m_s=stub.velocity_noise_m_s),

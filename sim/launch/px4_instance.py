@@ -12,25 +12,13 @@ from pathlib import Path
 from companion.config.endpoints import autopilot_port, companion_port
 from companion.core.frames import Geodetic
 from companion.errors import CompanionError, ConfigError
+from companion.terminal import one_line
 
 END_TIMEOUT_S = 6.0
 SIH_QUADROTOR = 10040
-FLEET_PARAMETERS: Mapping[str, float | int] = {
-    "COM_OBL_RC_ACT": 4,
-    "COM_RC_OVERRIDE": 3,
-    "MAN_OVERRIDE_SPD": 1.0,
-    "COM_RC_IN_MODE": 4,
-    "NAV_RCL_ACT": 0,
-    "NAV_DLL_ACT": 0,
-    "COM_RCL_EXCEPT": 4,
-    "SDLOG_MODE": -1,
-}
-"""a fleet without RC: land when the setpoints end; no stick input; no log on disk. Of `px4_versions.RENAMED` a
-version has one"""
-SIMULATOR_PARAMETERS: Mapping[str, float | int] = {"EKF2_ACC_NOISE": 0.6, "EKF2_GYR_NOISE": 0.1}
-"""what SIH's sensors are like: in flight their white noise is 0.5, 1.7 and 1.4 m/s^2 and 0.14, 0.07 and 0.03 rad/s a
-sample, of which the estimator's defaults (0.35 and 0.015) know nothing, so that it wanders by half a metre (see
-docs/px4.md)"""
+LAST_LINES = 5
+RUNNING = "already running for instance"
+"""what PX4 says where its lock is taken"""
 
 
 def parse_parameters(texts: Sequence[str]) -> dict[str, float | int]:
@@ -48,16 +36,6 @@ def parse_parameters(texts: Sequence[str]) -> dict[str, float | int]:
             raise ConfigError(f"--parameter must be NAME=VALUE, a PX4 parameter and a number, got {text!r}") from None
         parameters[name] = int(number) if number.is_integer() else number
     return parameters
-
-
-def check_build(build: Path) -> Path:
-    """The build folder, or CompanionError that says what it needs to hold."""
-    if not (build / "bin" / "px4").is_file() or not (build / "etc").is_dir():
-        raise CompanionError(
-            f"--px4 {build}: is no PX4 build folder (needs bin/px4 and etc/). Get PX4-Autopilot v1.16 from its "
-            "project, run `make px4_sitl_default` there and pass build/px4_sitl_default"
-        )
-    return build.resolve()
 
 
 class Px4Instance:
@@ -82,7 +60,8 @@ class Px4Instance:
         self.system_id = index + 1
         self.parameters = parameters
         self.build = build
-        with (folder / "px4.log").open("wb") as log:
+        self._log = folder / "px4.log"
+        with self._log.open("wb") as log:
             self.process = subprocess.Popen(
                 [sys.executable, "-I", "-S", "-c", _END_WITH_PARENT, str(build / "bin" / "px4"), "-i", str(index),
                  "-d", str(build / "etc"), "-w", str(folder)],
@@ -104,6 +83,23 @@ class Px4Instance:
             said = f"{done.stdout}{done.stderr}".strip()
             raise CompanionError(f"PX4 instance {self.index} opens no link on {autopilot_port(self.index)}: {said}")
 
+    @property
+    def _said(self) -> str:
+        return self._log.read_text(encoding="utf-8", errors="replace")
+
+    def last_words(self) -> str:
+        """What to say of a process that has ended at its start."""
+        text = self._said
+        lines = [one_line(re.sub(r"\x1b\[[0-9;]*m", "", line)) for line in text.splitlines() if line.strip()]
+        said = "".join(f"\n    {line}" for line in lines[-LAST_LINES:]) or " nothing"
+        why = ""
+        if RUNNING in text:
+            why = (
+                f": another PX4 of instance {self.index} runs on this machine, or ended without taking its lock away "
+                "(px4_lock and px4-sock in the folder of TMPDIR, or /tmp): end it, or remove them"
+            )
+        return f"PX4 ended at its start with status {self.process.poll()}{why}. The end of {self._log} says:{said}"
+
     def ask_to_end(self) -> None:
         """SIGTERM, from which PX4 ends in about two seconds."""
         if self.process.poll() is None:
@@ -117,7 +113,8 @@ class Px4Instance:
         except subprocess.TimeoutExpired:
             self.process.kill()
             self.process.wait()
-        Path(f"/tmp/px4-sock-{self.index}").unlink(missing_ok=True)
+        if RUNNING not in self._said:  # else it is another one's
+            Path(f"/tmp/px4-sock-{self.index}").unlink(missing_ok=True)
 
 
 _END_WITH_PARENT = f"""

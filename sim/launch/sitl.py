@@ -30,7 +30,8 @@ from companion.wire.mavlink_frames import HEAD_2
 from companion.wire.px4 import interval_parameters, parameter_value
 from sim.autopilot.stubs import TRUTH_DTYPE
 from sim.launch.ended import tell_ended
-from sim.launch.px4_instance import FLEET_PARAMETERS, SIMULATOR_PARAMETERS, Px4Instance
+from sim.launch.px4_build import FLEET_PARAMETERS, simulator_parameters
+from sim.launch.px4_instance import Px4Instance
 
 GCS_PORT = 14550
 GCS_PORT_OF_INSTANCE = 18570
@@ -59,7 +60,7 @@ class SitlSettings:
     truth_path: Path
     stop_fd: int
     parameters: Mapping[str, float | int]
-    """beyond FLEET_PARAMETERS and SIMULATOR_PARAMETERS, or instead of one of them"""
+    """beyond what `px4_build` has for a fleet on this build, or instead of one of them"""
     ready_path: Path | None = None
     """a file that is made once every parameter was read back as set"""
     log: Callable[[str], None] = print
@@ -78,7 +79,7 @@ class _Instance:
             )
         self.truth_socket = _bind(TRUTH_PORT + self.index, f"vehicle {vehicle.id}'s truth")
         home = ned_to_geodetic(Ned(vehicle.pad_north_m, vehicle.pad_east_m, 0.0), config.origin)
-        self.parameters = {**FLEET_PARAMETERS, **SIMULATOR_PARAMETERS, **settings.parameters}
+        self.parameters = {**FLEET_PARAMETERS, **simulator_parameters(settings.build), **settings.parameters}
         try:
             self.px4 = Px4Instance(
                 self.index, home, settings.build, settings.folder / f"px4-{vehicle.id}", self.parameters
@@ -260,7 +261,7 @@ class SitlHost:
                 return True
             for instance in waiting:
                 if instance.px4.process.poll() is not None:
-                    raise CompanionError(f"vehicle {instance.vehicle.id}: PX4 ended at its start; see its px4.log")
+                    raise CompanionError(f"vehicle {instance.vehicle.id}: {instance.px4.last_words()}")
                 system_id = instance.vehicle.system_id
                 if not instance.mode_streamed:
                     self._ask(instance, mavlink.MAVLink_command_long_message(

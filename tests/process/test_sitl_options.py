@@ -5,8 +5,10 @@ from pathlib import Path
 import pytest
 from fleet_process import run
 
-from companion.errors import ConfigError
-from sim.launch.px4_instance import parse_parameters
+from companion.core.frames import Geodetic
+from companion.errors import CompanionError, ConfigError
+from sim.launch.px4_build import NOISY_SENSORS, find_build, simulator_parameters
+from sim.launch.px4_instance import Px4Instance, parse_parameters
 
 pytestmark = pytest.mark.process
 
@@ -35,3 +37,59 @@ def test_parameters_are_names_and_finite_numbers() -> None:
     for wrong in ("COM_OBL_RC_ACT", "com=1", "A=", "A=nan", "A=inf", "=1", "A_NAME_LONGER_THAN_16=1", "A=1 2"):
         with pytest.raises(ConfigError, match="NAME=VALUE"):
             parse_parameters([wrong])
+
+
+def a_build(folder: Path, *names: str) -> Path:
+    """A folder that looks like a PX4 whose binary has parameters of these names."""
+    (folder / "bin").mkdir(parents=True)
+    (folder / "etc").mkdir()
+    (folder / "bin" / "px4").write_bytes(b"\0".join([b"", *(n.encode() for n in names), b""]))
+    return folder
+
+
+def test_a_px4_is_found_where_it_is_named_and_where_it_usually_lies(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("PX4_BUILD", raising=False)
+    monkeypatch.setattr("sim.launch.px4_build.PLACES", ("opt/px4", "build/px4_sitl_default"))
+    with pytest.raises(CompanionError, match=r"no PX4 is in PX4_BUILD, opt/px4, build/px4_sitl_default\. Get PX4-Auto"):
+        find_build(None)
+    beside = a_build(tmp_path / "build" / "px4_sitl_default")
+    assert find_build(None) == beside
+    package = a_build(tmp_path / "opt" / "px4")
+    assert find_build(None) == package
+    named = a_build(tmp_path / "named")
+    monkeypatch.setenv("PX4_BUILD", str(named))
+    assert find_build(None) == named
+    assert find_build(Path("opt/px4")) == package
+    monkeypatch.setenv("PX4_BUILD", str(tmp_path / "nowhere"))
+    with pytest.raises(CompanionError, match=r"PX4_BUILD=.*nowhere: is no PX4 build folder"):
+        find_build(None)
+
+
+def test_what_is_set_on_a_build_follows_from_the_parameters_that_it_has(tmp_path: Path) -> None:
+    old = a_build(tmp_path / "1.16", "COM_RC_OVERRIDE", "SDLOG_MODE")
+    new = a_build(tmp_path / "1.18", "MAN_OVERRIDE_SPD", "SDLOG_BACKEND", "SDLOG_MODE")
+    assert simulator_parameters(old) == NOISY_SENSORS
+    assert simulator_parameters(new) == {"SDLOG_BACKEND": 0}
+
+
+@pytest.mark.parametrize(
+    ("says", "why"),
+    [
+        ("INFO [px4] PX4 server already running for instance 0", "another PX4 of instance 0 runs on this machine"),
+        ("ERROR [param] no such thing", "says:"),
+    ],
+)
+def test_a_px4_that_ends_at_its_start_is_told_with_its_last_lines(tmp_path: Path, says: str, why: str) -> None:
+    build = a_build(tmp_path / "build")
+    program = build / "bin" / "px4"
+    program.write_text(f"#!/bin/sh\necho first\nprintf '\\033[31m{says}\\033[0m\\n'\nexit 3\n")
+    program.chmod(0o755)
+    instance = Px4Instance(0, Geodetic(47.4, 8.5, 488.0), build, tmp_path / "px4", {})
+    instance.process.wait(10)
+    words = instance.last_words()
+    assert "ended at its start with status 3" in words
+    assert why in words
+    assert f"{tmp_path / 'px4' / 'px4.log'} says:\n    first\n    {says}" in words

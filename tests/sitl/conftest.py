@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sim.launch.px4_instance import check_build
+from sim.launch.px4_build import find_build
 
 HERE = Path(__file__).parent
 for helpers in ("process", "wire"):
@@ -27,4 +27,4 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture(scope="session")
 def build() -> Path:
     """PX4's build folder; what is none fails each test at once."""
-    return check_build(Path(os.environ["PX4_BUILD"]))
+    return find_build(Path(os.environ["PX4_BUILD"]))

@@ -13,7 +13,8 @@ from pymavlink.dialects.v20 import development as dialect
 from companion.config import FleetConfig, load
 from companion.core.values import Phase
 from companion.wire.px4 import FORCE
-from sim.launch.px4_instance import FLEET_PARAMETERS, Px4Instance
+from sim.launch.px4_build import FLEET_PARAMETERS
+from sim.launch.px4_instance import Px4Instance
 
 DELAYS_S = (0.1, 0.3, 0.6, 0.9, 1.2, 1.6, 2.0)
 ARM = dialect.MAV_CMD_COMPONENT_ARM_DISARM
