@@ -82,10 +82,6 @@ class Weights(NamedTuple):
     """seconds by which the velocity relative to the plan carries the position on"""
     velocity: float
     """the part of the velocity relative to the plan that is left"""
-    returned: float
-    """the part of the place relative to the plan's by which it has moved meanwhile"""
-    pulled: float
-    """velocity that it gains per place relative to the plan's (1/s)"""
 
 
 def weights(kind: PlainKind, tau_s: float, damping_s: float) -> Weights:
@@ -99,17 +95,17 @@ def weights(kind: PlainKind, tau_s: float, damping_s: float) -> Weights:
 def damped(tau_s: float, damping_s: float) -> Weights:
     """Weights of the damped hold with time constant T_d = damping_s."""
     left = exp(-tau_s / damping_s)
-    return Weights(1.0, damping_s * (1.0 - left), left, 0.0, 0.0)
+    return Weights(1.0, damping_s * (1.0 - left), left)
 
 
 def zero() -> Weights:
     """Weights of the zero-order hold: the sample as it was."""
-    return Weights(0.0, 0.0, 1.0, 0.0, 0.0)
+    return Weights(0.0, 0.0, 1.0)
 
 
 def first(tau_s: float) -> Weights:
     """Weights of the first-order hold: the sample's own velocity goes on."""
-    return Weights(0.0, tau_s, 1.0, 0.0, 0.0)
+    return Weights(0.0, tau_s, 1.0)
 
 
 class Response(NamedTuple):
@@ -138,11 +134,17 @@ def response(tau_s: float, k_d: float, k_p: float) -> Response:
     return Response(c + half * s, s, -k_p * s, c - half * s)
 
 
-def returning(tau_s: float, off_m: float, k_v: float, k_p: float, saturation_m: float) -> Weights:
-    """Weights of the returning hold, `off_m` from the plan's place: the law's pull saturates, what is beyond stays."""
-    r = response(tau_s, k_v, k_p)
-    share = min(1.0, saturation_m / max(off_m, 1e-12))
-    return Weights(1.0, r.ed, r.dd, share * (r.ee - 1.0), share * r.de)
+def heeded(off_m: float, saturation_m: float) -> float:
+    """The part of a place so far from the plan's that the law's saturated error heeds."""
+    return 1.0 if off_m <= saturation_m else saturation_m / off_m
+
+
+def pulled(off: float, rate: float, share: float, r: Response) -> tuple[float, float]:
+    """Place (m) and velocity (m/s) relative to the plan's by then, along one axis, from `off` and `rate`.
+
+    `share`: of the place, as far as the law's saturation heeds it; the rest stays.
+    """
+    return (1.0 - share) * off + share * r.ee * off + r.ed * rate, share * r.de * off + r.dd * rate
 
 
 def axis(
@@ -150,10 +152,9 @@ def axis(
 ) -> tuple[float, float]:
     """Predicted position (m) and velocity (m/s) of one axis from the sample (p, v)."""
     relative = v - w.plan * vref_then
-    off = p - ref_then
     return (
-        p + w.plan * (ref_now - ref_then) + w.position * relative + w.returned * off,
-        w.plan * vref_now + w.velocity * relative + w.pulled * off,
+        p + w.plan * (ref_now - ref_then) + w.position * relative,
+        w.plan * vref_now + w.velocity * relative,
     )
 
 
@@ -207,12 +208,14 @@ class ReturningHold:
         p, v = sample.position_ned_m, sample.velocity_ned_m_s
         then_p, then_v = then
         now_p, now_v = now.position_ned_m, now.velocity_ned_m_s
-        off_m = hypot(p.north - then_p.north, p.east - then_p.east)
-        w, upright = returning(tau_s, off_m, self.k_v, self.k_p, self.saturation_m), damped(tau_s, self.plain.damping_s)
-        x, vx = axis(p.north, v.north, then_p.north, then_v.north, now_p.north, now_v.north, w)
-        y, vy = axis(p.east, v.east, then_p.east, then_v.east, now_p.east, now_v.east, w)
-        z, vz = axis(p.down, v.down, then_p.down, then_v.down, now_p.down, now_v.down, upright)
-        return new(Held, (new(Ned, (x, y, z)), new(Ned, (vx, vy, vz)), sample.told))
+        north, east = p.north - then_p.north, p.east - then_p.east
+        share, r = heeded(hypot(north, east), self.saturation_m), response(tau_s, self.k_v, self.k_p)
+        x, vx = pulled(north, v.north - then_v.north, share, r)
+        y, vy = pulled(east, v.east - then_v.east, share, r)
+        w = damped(tau_s, self.plain.damping_s)
+        z, vz = axis(p.down, v.down, then_p.down, then_v.down, now_p.down, now_v.down, w)
+        place = new(Ned, (now_p.north + x, now_p.east + y, z))
+        return new(Held, (place, new(Ned, (now_v.north + vx, now_v.east + vy, vz)), sample.told))
 
     def told_error_m(self, foreseen: tuple[float, ...], tells: tuple[float, ...]) -> float:
         """0."""

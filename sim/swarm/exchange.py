@@ -20,12 +20,13 @@ from sim.swarm.compiled import (
     elastic_threshold,
     exceeds,
     first,
+    heeded,
     inlined,
     kernel,
     observer_axis,
     period_ended,
+    pulled,
     response,
-    returning,
     switching_exceeds,
     switching_threshold,
     zero,
@@ -89,12 +90,11 @@ def predict(
         x = sample[0] - slot[0] + ref[now, m, 0] - ref[then, m, 0]
         y = sample[1] - slot[1] + ref[now, m, 1] - ref[then, m, 1]
         z = sample[2] - slot[2] + ref[now, m, 2] - ref[then, m, 2]
-        w = returning(tau, math.sqrt(x * x + y * y + z * z), o.hold_k_v, o.hold_k_p, o.hold_saturation)
+        share, r = heeded(math.sqrt(x * x + y * y + z * z), o.hold_saturation), response(tau, o.hold_k_v, o.hold_k_p)
         for k in range(3):
-            place = slot[k] - ref[now, m, k] + ref[then, m, k]
-            out[k], out[3 + k] = axis(
-                sample[k], sample[3 + k], place, ref[then, m, 3 + k], slot[k], ref[now, m, 3 + k], w
-            )
+            off = sample[k] - slot[k] + ref[now, m, k] - ref[then, m, k]
+            place, velocity = pulled(off, sample[3 + k] - ref[then, m, 3 + k], share, r)
+            out[k], out[3 + k] = slot[k] + place, ref[now, m, 3 + k] + velocity
         return
     for k in range(3):
         out[k], out[3 + k] = axis(

@@ -1,6 +1,6 @@
 """Holds: the damped and the returning one solve their differential equations, the others are what their names say."""
 
-from math import cos, exp, hypot, inf, sin
+from math import cos, exp, hypot, sin
 
 import numpy as np
 import pytest
@@ -9,7 +9,17 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from companion.core.frames import Ned
-from companion.core.prediction import PlainHold, PlainKind, ReturningHold, Weights, axis, damped, returning, weights
+from companion.core.prediction import (
+    PlainHold,
+    PlainKind,
+    ReturningHold,
+    Weights,
+    axis,
+    damped,
+    pulled,
+    response,
+    weights,
+)
 from companion.core.trajectory.fleet import Reference
 from companion.core.values import ZERO, PeerSample, Phase
 
@@ -90,9 +100,9 @@ def test_holding_twice_is_holding_once(damping_s: float, first_s: float, second_
 
 
 def test_weights_of_a_known_age() -> None:
-    assert weights("damped", 0.7, 0.7) == pytest.approx(Weights(1.0, 0.7 * (1 - exp(-1)), exp(-1), 0.0, 0.0))
-    assert weights("zero", 5.0, 0.7) == (0.0, 0.0, 1.0, 0.0, 0.0)
-    assert weights("first", 5.0, 0.7) == (0.0, 5.0, 1.0, 0.0, 0.0)
+    assert weights("damped", 0.7, 0.7) == pytest.approx(Weights(1.0, 0.7 * (1 - exp(-1)), exp(-1)))
+    assert weights("zero", 5.0, 0.7) == (0.0, 0.0, 1.0)
+    assert weights("first", 5.0, 0.7) == (0.0, 5.0, 1.0)
 
 
 # -- the returning hold ------------------------------------------------------------------------------------------------
@@ -113,8 +123,8 @@ def test_returning_hold_solves_its_differential_equation(
 
     solution = solve_ivp(rate, (start, start + tau_s), [p, v], rtol=1e-9, atol=1e-9)
     then, now = reference(start), reference(start + tau_s)
-    held = axis(p, v, then[0], then[1], now[0], now[1], returning(tau_s, abs(p - then[0]), k_v, k_p, inf))
-    assert held == pytest.approx(tuple(solution.y[:, -1]), abs=2e-5)
+    off, rate = pulled(p - then[0], v - then[1], 1.0, response(tau_s, k_v, k_p))
+    assert (now[0] + off, now[1] + rate) == pytest.approx(tuple(solution.y[:, -1]), abs=2e-5)
 
 
 def state(p: Ned, v: Ned) -> PeerSample:
