@@ -16,6 +16,10 @@ from companion.terminal import one_line
 
 END_TIMEOUT_S = 6.0
 SIH_QUADROTOR = 10040
+STATE_PORT = 20570
+"""from which instance i tells its state: this plus i"""
+OFFBOARD_PORT = 14580
+"""from which PX4's scripts have instance i speak to its companion: this plus i"""
 LAST_LINES = 5
 RUNNING = "already running for instance"
 """what PX4 says where its lock is taken"""
@@ -60,6 +64,8 @@ class Px4Instance:
         self.system_id = index + 1
         self.parameters = parameters
         self.build = build
+        self.state_link = False
+        """whether its state comes over a link of its own"""
         self._log = folder / "px4.log"
         with self._log.open("wb") as log:
             self.process = subprocess.Popen(
@@ -69,19 +75,30 @@ class Px4Instance:
                 start_new_session=True,
             )  # fmt: skip
 
+    def open_state_link(self, port: int) -> bool:
+        """A link that tells arming and mode to that port, so that 14550 is left to a ground station.
+
+        Whether it is open: an instance that has just begun may not take commands yet.
+        """
+        if not self.state_link:
+            own, speed = str(STATE_PORT + self.index), ("-r", "4000000", "-f")
+            self.state_link = self._mavlink("start", "-x", "-u", own, *speed, "-o", str(port)).returncode == 0
+        return self.state_link
+
     def open_offboard_link(self) -> None:
-        """Past ten instances: a link of its own, since PX4's scripts would send all to one port."""
-        command = (
-            "start", "-x", "-u", str(autopilot_port(self.index)), "-r", "4000000", "-f", "-m", "onboard",
-            "-o", str(companion_port(self.index)),
-        )  # fmt: skip
-        done = subprocess.run(
+        """Past ten instances: a link of its own in place of the one that PX4's scripts send to one port for all."""
+        own, speed = str(autopilot_port(self.index)), ("-r", "4000000", "-f", "-m", "onboard")
+        done = self._mavlink("start", "-x", "-u", own, *speed, "-o", str(companion_port(self.index)))
+        if done.returncode != 0:
+            said = f"{done.stdout}{done.stderr}".strip()
+            raise CompanionError(f"PX4 instance {self.index} opens no link on {own}: {said}")
+        self._mavlink("stop", "-u", str(OFFBOARD_PORT + self.index))
+
+    def _mavlink(self, *command: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
             [str(self.build / "bin" / "px4-mavlink"), "--instance", str(self.index), *command],
             check=False, capture_output=True, text=True, timeout=10,
         )  # fmt: skip
-        if done.returncode != 0:
-            said = f"{done.stdout}{done.stderr}".strip()
-            raise CompanionError(f"PX4 instance {self.index} opens no link on {autopilot_port(self.index)}: {said}")
 
     @property
     def _said(self) -> str:

@@ -2,7 +2,8 @@
 
 PX4 takes instance numbers: instance i has system id i + 1 and speaks to UDP 14540 + i; past ten it would send all to
 14549, so those get one more MAVLink link by the port rule of `companion.config.endpoints`. The simulator's truth comes
-as HIL_STATE_QUATERNION on 19410 + i, the state of arming and mode from the ground station's link on 14550.
+as HIL_STATE_QUATERNION on 19410 + i, the state of arming and mode over a link that each instance is told to open. The
+ground station's port, 14550, is left to a ground station.
 """
 
 import os
@@ -31,10 +32,8 @@ from companion.wire.px4 import interval_parameters, parameter_value
 from sim.autopilot.stubs import TRUTH_DTYPE
 from sim.launch.ended import tell_ended
 from sim.launch.px4_build import FLEET_PARAMETERS, simulator_parameters
-from sim.launch.px4_instance import Px4Instance
+from sim.launch.px4_instance import STATE_PORT, Px4Instance
 
-GCS_PORT = 14550
-GCS_PORT_OF_INSTANCE = 18570
 TRUTH_PORT = 19410
 PX4_PORTS = 10
 """instances for which PX4's own scripts open an offboard link of their own"""
@@ -131,8 +130,9 @@ class SitlHost:
         self._mav.robust_parsing = True
         self._flushed_ns = 0
         try:
-            self._gcs = _bind(GCS_PORT, "the instances' state (is a ground station running?)")
-            self._stack.callback(self._gcs.close)
+            self._states = _bind(0, "the instances' state")
+            self._stack.callback(self._states.close)
+            self._states_port: int = self._states.getsockname()[1]
             self._file = self._stack.enter_context(settings.truth_path.open("ab"))
             self.instances: list[_Instance] = []
             for vehicle in config.vehicles:
@@ -181,9 +181,9 @@ class SitlHost:
                 tell_ended(self.settings.folder, instance.vehicle.id, f"PX4 ended with status {status}")
 
     def _serve(self, timeout_s: float, stop_fds: Sequence[int]) -> bool:
-        sockets: list[Any] = [self._gcs, *(i.truth_socket for i in self.instances)]
+        sockets: list[Any] = [self._states, *(i.truth_socket for i in self.instances)]
         ready, _, _ = select.select([*sockets, *stop_fds], [], [], timeout_s)
-        if self._gcs in ready:
+        if self._states in ready:
             self._read_states()
         for instance in self.instances:
             if instance.truth_socket in ready:
@@ -207,7 +207,7 @@ class SitlHost:
                     yield received_unix_ns(ancillary), message
 
     def _read_states(self) -> None:
-        for time_unix_ns, message in self._messages(self._gcs, STATE_MESSAGES):
+        for time_unix_ns, message in self._messages(self._states, STATE_MESSAGES):
             instance = self._by_system.get(message.get_srcSystem())
             if instance is None or message.get_srcComponent() != 1:
                 continue
@@ -262,6 +262,8 @@ class SitlHost:
             for instance in waiting:
                 if instance.px4.process.poll() is not None:
                     raise CompanionError(f"vehicle {instance.vehicle.id}: {instance.px4.last_words()}")
+                if not instance.px4.open_state_link(self._states_port):
+                    continue
                 system_id = instance.vehicle.system_id
                 if not instance.mode_streamed:
                     self._ask(instance, mavlink.MAVLink_command_long_message(
@@ -277,7 +279,7 @@ class SitlHost:
         raise CompanionError(f"PX4 parameters not as set after {STARTUP_TIMEOUT_S:.0f} s: {missing or 'silent'}")
 
     def _ask(self, instance: _Instance, message: Any) -> None:
-        self._gcs.sendto(message.pack(self._mav), ("127.0.0.1", GCS_PORT_OF_INSTANCE + instance.index))
+        self._states.sendto(message.pack(self._mav), ("127.0.0.1", STATE_PORT + instance.index))
 
 
 def told_value(message: Any) -> float | int:
