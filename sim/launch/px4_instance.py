@@ -87,12 +87,12 @@ class Px4Instance:
 
     def open_offboard_link(self) -> None:
         """Past ten instances: a link of its own in place of the one that PX4's scripts send to one port for all."""
+        self._mavlink("stop", "-u", str(OFFBOARD_PORT + self.index))  # PX4 has room for six links
         own, speed = str(autopilot_port(self.index)), ("-r", "4000000", "-f", "-m", "onboard")
         done = self._mavlink("start", "-x", "-u", own, *speed, "-o", str(companion_port(self.index)))
         if done.returncode != 0:
             said = f"{done.stdout}{done.stderr}".strip()
             raise CompanionError(f"PX4 instance {self.index} opens no link on {own}: {said}")
-        self._mavlink("stop", "-u", str(OFFBOARD_PORT + self.index))
 
     def _mavlink(self, *command: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
