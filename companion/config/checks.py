@@ -88,6 +88,7 @@ def _table_faults(config: FleetConfig) -> Iterator[str]:
             f"$.launch.spacing_m / $.vehicle[].pad_m: pads must be at least the safety radius "
             f"{config.safety_radius_m:.2f} m apart ({config.radius_reason}), got {minimum_distance(pads):.2f} m"
         )
+    yield from config.law.faults()
     yield from config.trigger.faults()
     if config.peers.range_m < config.range_min_m:
         yield (

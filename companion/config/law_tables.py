@@ -1,5 +1,6 @@
 """The table of the law: one class for each kind, which makes the law that is flown."""
 
+from collections.abc import Iterator
 from typing import Annotated, Literal
 
 from pydantic import Field, PlainValidator, SerializeAsAny
@@ -10,11 +11,13 @@ from companion.core.law.base import Law
 from companion.core.law.intent import IntentGains, IntentHold, IntentLaw
 from companion.core.law.paper import paper_gains
 from companion.core.law.starling import Gains, StarlingLaw
-from companion.core.prediction import Hold, PlainHold, PlainKind, ReturningHold
+from companion.core.prediction import Hold, PlainHold, PlainKind, Pull, ReturningHold
 
 HoldKind = Literal["returning", PlainKind]
 SATURATION_M, SATURATION_M_S = 1.0, 1.0
 """of the starling law's errors in place and velocity"""
+RETURN_MIN_PER_S = 0.1
+"""slower, a prediction runs away with its velocity, as with a damping of more than 10 s"""
 
 
 class LawTable(KindTable):
@@ -36,6 +39,10 @@ class LawTable(KindTable):
     def holding(self) -> Hold:
         """How a vehicle that flies this law is predicted, by itself and by all others; a law may have its own."""
         return PlainHold(self.hold, self.hold_damping_s)
+
+    def faults(self) -> Iterator[str]:
+        """What is wrong with the values together, as sentences that name the keys."""
+        yield from ()
 
 
 class StarlingTable(LawTable):
@@ -62,7 +69,16 @@ class StarlingTable(LawTable):
         """See `LawTable`."""
         if self.hold != "returning":
             return super().holding()
-        return ReturningHold(self.k_v, self.k_p, SATURATION_M, PlainHold("damped", self.hold_damping_s))
+        pull = Pull(self.k_v, self.k_p, SATURATION_M, self.a_max_m_s2)
+        return ReturningHold(pull, PlainHold("damped", self.hold_damping_s))
+
+    def faults(self) -> Iterator[str]:
+        """See `LawTable`."""
+        if self.hold == "returning" and self.k_v < RETURN_MIN_PER_S:
+            yield (
+                f'$.law.k_v must be at least {RETURN_MIN_PER_S:g} 1/s with $.law.hold = "returning", which predicts that '
+                f'so a velocity fades, got {self.k_v:g}; or take hold = "damped"'
+            )
 
 
 class PaperTable(LawTable):

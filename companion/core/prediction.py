@@ -134,17 +134,40 @@ def response(tau_s: float, k_d: float, k_p: float) -> Response:
     return Response(c + half * s, s, -k_p * s, c - half * s)
 
 
-def heeded(off_m: float, saturation_m: float) -> float:
-    """The part of a place so far from the plan's that the law's saturated error heeds."""
-    return 1.0 if off_m <= saturation_m else saturation_m / off_m
+class Pull(NamedTuple):
+    """How a law pulls a vehicle back to the plan: its gains and limits."""
+
+    k_v: float
+    """1/s"""
+    k_p: float
+    """1/s^2"""
+    saturation_m: float
+    """norm at which its position error saturates"""
+    a_max_m_s2: float
 
 
-def pulled(off: float, rate: float, share: float, r: Response) -> tuple[float, float]:
-    """Place (m) and velocity (m/s) relative to the plan's by then, along one axis, from `off` and `rate`.
+def share_within(k_d: float, k_p: float, off_m: float, rate_m_s: float, a_max_m_s2: float) -> float:
+    """The part of a response from that place and velocity of which no acceleration is larger than the limit.
 
-    `share`: of the place, as far as the law's saturation heeds it; the rest stays.
+    k_p e^2 + e'^2 and k_p e'^2 + e''^2 never grow: so |e''| <= k_p |e_k| + sqrt(k_d^2 + k_p) |e'_k|.
     """
-    return (1.0 - share) * off + share * r.ee * off + r.ed * rate, share * r.de * off + r.dd * rate
+    return min(1.0, a_max_m_s2 / max(k_p * off_m + sqrt(k_d * k_d + k_p) * rate_m_s, 1e-12))
+
+
+def returning(tau_s: float, off_m: float, rate_m_s: float, pull: Pull, damped: Weights) -> Response:
+    """The response to the plan's pull from that far off and that fast, relative to the plan.
+
+    What is beyond the law's saturation stays where it is; what is beyond its limit is damped.
+    """
+    heeded = 1.0 if off_m <= pull.saturation_m else pull.saturation_m / off_m
+    share = share_within(pull.k_v, pull.k_p, heeded * off_m, rate_m_s, pull.a_max_m_s2)
+    r, rest = response(tau_s, pull.k_v, pull.k_p), 1.0 - share
+    return Response(
+        1.0 + heeded * share * (r.ee - 1.0),
+        share * r.ed + rest * damped.position,
+        heeded * share * r.de,
+        share * r.dd + rest * damped.velocity,
+    )
 
 
 def axis(
@@ -193,12 +216,7 @@ class ReturningHold:
     """`Hold` by the law's own pull to the plan; the vertical, which is flown by position, and flight without a plan,
     which has no place to be pulled to, are held damped."""
 
-    k_v: float
-    """the law's, 1/s"""
-    k_p: float
-    """the law's, 1/s^2"""
-    saturation_m: float
-    """norm at which the law's position error saturates"""
+    pull: Pull
     plain: PlainHold
 
     def at(self, sample: PeerSample, then: tuple[Ned, Ned], now: Reference, tau_s: float) -> Held:
@@ -209,27 +227,29 @@ class ReturningHold:
         then_p, then_v = then
         now_p, now_v = now.position_ned_m, now.velocity_ned_m_s
         north, east = p.north - then_p.north, p.east - then_p.east
-        share, r = heeded(hypot(north, east), self.saturation_m), response(tau_s, self.k_v, self.k_p)
-        x, vx = pulled(north, v.north - then_v.north, share, r)
-        y, vy = pulled(east, v.east - then_v.east, share, r)
+        v_north, v_east = v.north - then_v.north, v.east - then_v.east
         w = damped(tau_s, self.plain.damping_s)
+        ee, ed, de, dd = returning(tau_s, hypot(north, east), hypot(v_north, v_east), self.pull, w)
         z, vz = axis(p.down, v.down, then_p.down, then_v.down, now_p.down, now_v.down, w)
-        place = new(Ned, (now_p.north + x, now_p.east + y, z))
-        return new(Held, (place, new(Ned, (now_v.north + vx, now_v.east + vy, vz)), sample.told))
+        place = now_p.north + ee * north + ed * v_north, now_p.east + ee * east + ed * v_east, z
+        velocity = now_v.north + de * north + dd * v_north, now_v.east + de * east + dd * v_east, vz
+        return new(Held, (new(Ned, place), new(Ned, velocity), sample.told))
 
     def told_error_m(self, foreseen: tuple[float, ...], tells: tuple[float, ...]) -> float:
         """0."""
         return self.plain.told_error_m(foreseen, tells)
 
     def bounds(self, speed_max_m_s: float) -> HoldBounds:
-        """Of e'' + k_v e' + k_p e = 0 from a place within the saturation and a speed within the limit.
+        """The response within the law's limit, what is beyond that damped; the vertical is damped alone.
 
-        k_p e^2 + e'^2 and k_p e'^2 + e''^2 never grow: the first bounds the speed that the place adds, the second e''.
+        The place adds to the speed what k_p e^2 + e'^2, which never grows, has from it.
         """
-        pull, speed = self.k_p * self.saturation_m, speed_max_m_s
-        braking = hypot(self.k_v * speed + pull, sqrt(self.k_p) * speed)
-        damped_too = self.plain.bounds(speed)
-        return HoldBounds(max(braking, damped_too.braking_m_s2), 0.0, sqrt(self.k_p) * self.saturation_m)
+        k_v, k_p, off_m, a_max = self.pull
+        damped_m_s2 = self.plain.bounds(speed_max_m_s).braking_m_s2
+        share = share_within(k_v, k_p, off_m, speed_max_m_s, a_max)
+        asked = hypot(k_v * speed_max_m_s + k_p * off_m, sqrt(k_p) * speed_max_m_s)
+        braking = asked if share == 1.0 else a_max + (1.0 - share) * damped_m_s2
+        return HoldBounds(max(braking, damped_m_s2), 0.0, sqrt(k_p) * off_m)
 
 
 class CommonWay(NamedTuple):

@@ -68,7 +68,7 @@ def _autopilot(config: FleetConfig, vehicle: Vehicle, seconds: float) -> Iterato
         clock = FleetClock()
         received = listen(link, autopilot, clock, seconds)
         yield Check("bytes", received, "> 0", received > 0, f"nothing came on {vehicle.mavlink} in {seconds:g} s")
-        damaged = autopilot.rejected["malformed"]
+        damaged = autopilot.rejected.get("malformed", 0)
         yield Check("damaged frames", damaged, "= 0", damaged == 0, f"{damaged} frames came damaged: baud rate, cable?")
         yield from own_checks(autopilot.facts(clock.now()), config, vehicle)
     finally:

@@ -15,8 +15,9 @@ from companion.errors import CompanionError, ConfigError
 from companion.terminal import one_line
 
 END_TIMEOUT_S = 6.0
+MAVLINK_TIMEOUT_S = 10.0
 SIH_QUADROTOR = 10040
-STATE_PORT = 20570
+STATE_PORT = 24800
 """from which instance i tells its state: this plus i"""
 OFFBOARD_PORT = 14580
 """from which PX4's scripts have instance i speak to its companion: this plus i"""
@@ -95,10 +96,13 @@ class Px4Instance:
             raise CompanionError(f"PX4 instance {self.index} opens no link on {own}: {said}")
 
     def _mavlink(self, *command: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [str(self.build / "bin" / "px4-mavlink"), "--instance", str(self.index), *command],
-            check=False, capture_output=True, text=True, timeout=10,
-        )  # fmt: skip
+        words = [str(self.build / "bin" / "px4-mavlink"), "--instance", str(self.index), *command]
+        try:
+            return subprocess.run(words, check=False, capture_output=True, text=True, timeout=MAVLINK_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            return subprocess.CompletedProcess(words, 1, "", f"no answer within {MAVLINK_TIMEOUT_S:g} s")
+        except OSError as error:
+            raise CompanionError(f"{words[0]}: cannot be run: {error.strerror} (is the PX4 build whole?)") from error
 
     @property
     def _said(self) -> str:

@@ -84,6 +84,7 @@ def show_summary(summary: Mapping[str, Any]) -> None:
         ("formed after", _unit(summary["formed_after_s"], "s")),
         ("minimum distance", _unit(summary["minimum_distance_m"], "m")),
         ("formation error, rms", _unit(steady["formation_error_rms_m"], f"m over {steady['seconds']} s")),
+        ("the same, estimates' errors unlike", _unit(summary["estimates"]["formation_error_decorrelated_rms_m"], "m")),
         ("velocity error, rms", _unit(steady["velocity_error_rms_m_s"], "m/s")),
         ("centroid from plan, rms", _unit(steady["centroid_error_rms_m"], "m")),
         ("messages a vehicle", _unit(steady["messages_per_vehicle_hz"], "/s")),

@@ -5,7 +5,7 @@ import math
 
 from companion.core.law.base import FIELDS_MAX
 from companion.core.law.intent import IntentGains, IntentTrigger
-from companion.core.prediction import Weights
+from companion.core.prediction import Pull, Weights
 from companion.core.trigger.error import ErrorTrigger
 from companion.core.trigger.switching import SwitchingTrigger
 from companion.core.values import CommonMotion
@@ -20,13 +20,12 @@ from sim.swarm.compiled import (
     elastic_threshold,
     exceeds,
     first,
-    heeded,
     inlined,
     kernel,
     observer_axis,
     period_ended,
-    pulled,
     response,
+    returning,
     switching_exceeds,
     switching_threshold,
     zero,
@@ -87,14 +86,17 @@ def predict(
         out[2], out[5] = axis(sample[2], sample[5], 0.0, sample[8], upright.north_m, out[11], w)
         return
     if o.hold == HOLD_RETURNING:
-        x = sample[0] - slot[0] + ref[now, m, 0] - ref[then, m, 0]
-        y = sample[1] - slot[1] + ref[now, m, 1] - ref[then, m, 1]
-        z = sample[2] - slot[2] + ref[now, m, 2] - ref[then, m, 2]
-        share, r = heeded(math.sqrt(x * x + y * y + z * z), o.hold_saturation), response(tau, o.hold_k_v, o.hold_k_p)
+        off2, rate2 = 0.0, 0.0
+        for k in range(3):
+            off2 += (sample[k] - slot[k] + ref[now, m, k] - ref[then, m, k]) ** 2
+            rate2 += (sample[3 + k] - ref[then, m, 3 + k]) ** 2
+        pull = Pull(o.hold_k_v, o.hold_k_p, o.hold_saturation, o.hold_a_max)
+        r = returning(tau, math.sqrt(off2), math.sqrt(rate2), pull, w)
         for k in range(3):
             off = sample[k] - slot[k] + ref[now, m, k] - ref[then, m, k]
-            place, velocity = pulled(off, sample[3 + k] - ref[then, m, 3 + k], share, r)
-            out[k], out[3 + k] = slot[k] + place, ref[now, m, 3 + k] + velocity
+            rate = sample[3 + k] - ref[then, m, 3 + k]
+            out[k] = slot[k] + r.ee * off + r.ed * rate
+            out[3 + k] = ref[now, m, 3 + k] + r.de * off + r.dd * rate
         return
     for k in range(3):
         out[k], out[3 + k] = axis(

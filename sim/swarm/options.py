@@ -91,6 +91,7 @@ def run_options(setup: Setup) -> Options:
         hold_k_v=setup.k_v,
         hold_k_p=setup.k_p,
         hold_saturation=setup.saturation_m,
+        hold_a_max=setup.a_max_m_s2,
         trigger=_TRIGGERS[setup.trigger],
         t_min=setup.t_min_s,
         t_max=setup.t_max_s,

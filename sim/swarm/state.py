@@ -43,6 +43,7 @@ class Options(NamedTuple):
     """of the returning hold: the law's"""
     hold_k_p: float
     hold_saturation: float
+    hold_a_max: float
     trigger: int
     t_min: float
     t_max: float

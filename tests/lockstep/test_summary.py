@@ -22,7 +22,7 @@ from companion.core.values import Phase
 from companion.wire.peer import encode_motion
 from companion.wire.px4 import Px4Mode
 from sim.autopilot.faults import Fault, FaultKind
-from sim.launch.summary.flight import Flight
+from sim.launch.summary.flight import POSITION, TICK_ROWS, VELOCITY, Flight
 from sim.launch.summary.summarise import summarise
 from sim.lockstep.clockwork import UTC_AT_START_NS
 from sim.lockstep.lockstep import Lockstep
@@ -43,9 +43,15 @@ class Flown:
     nearer_ns: int | None = None
     """when vehicle 2 is 0.4 m north of vehicle 1 for a tenth of a second, whatever it flew"""
 
+    believed: bool = False
+    """whether companions' own accounts are there"""
+    astray_m: float = 0.0
+    """all vehicles are truly off what they are by up to so much north and back, together: an error of all estimates"""
+
     @property
     def rows(self) -> Any:
         rows = self.ls.truth()
+        rows["position_ned_m"][:, 0] += self.astray_m * np.sin(1e-9 * (rows["time_unix_ns"] - UTC_AT_START_NS))
         if self.nearer_ns is not None:
             then = (rows["time_unix_ns"] >= self.nearer_ns) & (rows["time_unix_ns"] < self.nearer_ns + 100_000_000)
             first = rows["position_ned_m"][then & (rows["vehicle_id"] == 1)]
@@ -62,7 +68,21 @@ class Flown:
         )  # fmt: skip
         for i in self.ls.vehicles:
             flight.read(i, self.tape.entries[i])
+            if self.believed:
+                flight.ticks[i] = self.ticks(i)
         return summarise(flight)
+
+    def ticks(self, i: int) -> Any:
+        """What a companion would have recorded of itself: an estimate with an error of its own of 0.01 m."""
+        rows = self.ls.truth()
+        rows = rows[rows["vehicle_id"] == i]
+        ticks = np.zeros(len(rows), TICK_ROWS)
+        ticks["fleet_ns"] = rows["time_unix_ns"]
+        noise = np.random.default_rng(i).normal(0.0, 0.01, (len(rows), 3))
+        for k, (place, speed) in enumerate(zip(POSITION, VELOCITY, strict=True)):
+            ticks[place] = rows["position_ned_m"][:, k] + noise[:, k]
+            ticks[speed] = rows["velocity_ned_m_s"][:, k]
+        return ticks
 
     def end_autopilot(self, i: int) -> None:
         """As a simulated autopilot whose process is killed: nothing more is told, by it or of it."""
@@ -174,6 +194,23 @@ def test_a_plain_flight_passes_with_the_figures_of_the_definitions() -> None:
     assert 0.3 < summary["touchdown_max_m_s"] < 1.5
     (command,) = summary["commands"]
     assert (command["verb"], command["issuer"], command["accepted"]) == ("takeoff", "lockstep", [1, 2, 3])
+
+
+def test_errors_that_all_estimates_share_are_told_and_what_the_formation_would_be_without_that() -> None:
+    f = flown(fleet(COUNT, legs=straight(15.0)))
+    until_formed(f.ls)
+    until_landed(f.ls)
+    f.believed = True
+    own, own_f_m = f.summary()["estimates"], f.summary()["steady"]["formation_error_rms_m"]
+    assert abs(own["pair_correlation"]) < 0.5
+    assert own["error_rms_m"] < 0.15
+    f.astray_m = 0.5
+    shared, shared_f_m = f.summary()["estimates"], f.summary()["steady"]["formation_error_rms_m"]
+    assert shared["pair_correlation"] > 0.9
+    assert shared["error_rms_m"] > 0.3
+    assert shared_f_m == pytest.approx(own_f_m, abs=1e-3), "copies cancel"
+    assert shared["formation_error_decorrelated_rms_m"] > 2.0 * shared_f_m
+    assert own["formation_error_decorrelated_rms_m"] == pytest.approx(own_f_m, abs=0.01)
 
 
 def command(ls: Lockstep, motion: FleetTrajectory) -> list[bool]:

@@ -25,7 +25,10 @@ pytestmark = pytest.mark.process
         (("--autopilot", "ardupilot"), "stub, px4 or external"),
     ],
 )
-def test_wrong_words_are_refused_with_what_would_be_right(tmp_path: Path, words: tuple[str, ...], why: str) -> None:
+def test_wrong_words_are_refused_with_what_would_be_right(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], why: str
+) -> None:
+    monkeypatch.setenv("PX4_BUILD", str(tmp_path / "none"))  # a machine may have one, which would fly
     done = run("sim", "up", "--out", str(tmp_path / "flights"), *words, folder=tmp_path)
     assert done.returncode != 0
     assert why in done.stderr
@@ -79,7 +82,7 @@ def test_what_is_set_on_a_build_follows_from_the_parameters_that_it_has(tmp_path
     ("says", "why"),
     [
         ("INFO [px4] PX4 server already running for instance 0", "another PX4 of instance 0 runs on this machine"),
-        ("ERROR [param] no such thing", "says:"),
+        ("ERROR [param] no such thing", ""),
     ],
 )
 def test_a_px4_that_ends_at_its_start_is_told_with_its_last_lines(tmp_path: Path, says: str, why: str) -> None:
@@ -91,5 +94,41 @@ def test_a_px4_that_ends_at_its_start_is_told_with_its_last_lines(tmp_path: Path
     instance.process.wait(10)
     words = instance.last_words()
     assert "ended at its start with status 3" in words
+    assert ("another PX4" in words) == bool(why)
     assert why in words
     assert f"{tmp_path / 'px4' / 'px4.log'} says:\n    first\n    {says}" in words
+
+
+@pytest.mark.parametrize("running", [True, False])
+def test_a_socket_that_is_another_px4s_is_left_alone(tmp_path: Path, running: bool) -> None:
+    build = a_build(tmp_path / "build")
+    program = build / "bin" / "px4"
+    program.write_text(f"#!/bin/sh\necho {'PX4 server already running for instance 249' if running else 'ended'}\n")
+    program.chmod(0o755)
+    socket_file = Path("/tmp/px4-sock-249")
+    if socket_file.exists():
+        pytest.skip("a PX4 of instance 249 runs here")
+    instance = Px4Instance(249, Geodetic(47.4, 8.5, 488.0), build, tmp_path / "px4", {})
+    instance.process.wait(10)
+    socket_file.touch()
+    try:
+        instance.end()
+        assert socket_file.exists() == running
+    finally:
+        socket_file.unlink(missing_ok=True)
+
+
+def test_a_build_whose_commands_cannot_be_run_is_told_and_one_that_hangs_is_asked_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    build = a_build(tmp_path / "build")
+    (build / "bin" / "px4").write_text("#!/bin/sh\nexit 0\n")
+    (build / "bin" / "px4").chmod(0o755)
+    instance = Px4Instance(249, Geodetic(47.4, 8.5, 488.0), build, tmp_path / "px4", {})
+    instance.process.wait(10)
+    with pytest.raises(CompanionError, match=r"px4-mavlink: cannot be run: .*is the PX4 build whole"):
+        instance.open_state_link(1)
+    (build / "bin" / "px4-mavlink").write_text("#!/bin/sh\nexec sleep 5\n")
+    (build / "bin" / "px4-mavlink").chmod(0o755)
+    monkeypatch.setattr("sim.launch.px4_instance.MAVLINK_TIMEOUT_S", 0.2)
+    assert not instance.open_state_link(1)

@@ -1,4 +1,4 @@
-"""Tests that fly a real PX4 SITL: they need a build of PX4 v1.16 and its UDP ports for themselves."""
+"""Tests that fly a real PX4 SITL: they need a build of PX4 and its UDP ports for themselves."""
 
 import os
 import sys
@@ -21,7 +21,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.sitl)
             item.add_marker(pytest.mark.timeout(400))
             if not build:
-                item.add_marker(pytest.mark.skip(reason="PX4_BUILD names no build folder of PX4 v1.16 (docs/px4.md)"))
+                item.add_marker(pytest.mark.skip(reason="PX4_BUILD names no build folder of PX4 (docs/px4.md)"))
 
 
 @pytest.fixture(scope="session")

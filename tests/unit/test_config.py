@@ -5,7 +5,7 @@ import math
 import re
 import tomllib
 from collections.abc import Callable, Iterator
-from math import sqrt
+from math import hypot, sqrt
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from companion.config.overrides import plan_legs, resize
 from companion.core.frames import Ned
 from companion.core.law.starling import StarlingLaw
 from companion.core.monitor import own_error_m
-from companion.core.prediction import PlainHold, ReturningHold
+from companion.core.prediction import PlainHold, Pull, ReturningHold
 from companion.core.safety.fence import Fence
 from companion.core.trajectory.legs import GotoLeg, TurnLeg, VelocityLeg
 from companion.errors import ConfigError
@@ -368,6 +368,8 @@ ACROSS = [
     (put("trigger", {"t_min_s": 0.5, "t_max_s": 0.5}), "$.trigger.t_min_s", "below $.trigger.t_max_s = 0.5", "got 0.5"),
     (put("peers.range_m", 0.5), "$.peers.range_m", "must be at least 6.96 m", "got 0.5"),
     (put("peers.range_m", 6.95), "$.peers.range_m", "must be at least 6.96 m", "got 6.95"),
+    (put("law.k_v", 0.09), "$.law.k_v", 'at least 0.1 1/s with $.law.hold = "returning"',
+     'got 0.09; or take hold = "damped"'),
     (put("trigger.t_min_s", 0.11), "$.trigger.t_min_s", "<= $.trigger.near_period_s = 0.1 s", "got 0.11"),
     (periodic(0.04), "$.trigger.period_s", ">= $.trigger.t_min_s = 0.05 s", "got 0.04"),
     (periodic(60.0), "$.launch.spacing_m", "87.19 m apart (86.54 m of it since a peer is known no better with "
@@ -607,9 +609,18 @@ def test_what_a_hold_leaves_out_counts_in_a_periods_bound(hold: str) -> None:
     assert motion.speed_m_s == pytest.approx(8.0 + (sqrt(0.3) if hold == "returning" else 0.0))
 
 
+def test_a_returning_hold_beyond_the_laws_limit_counts_in_what_is_damped_of_it() -> None:
+    strong = parse(changed(put("law.k_v", 3.0), put("law.hold", "returning")), "fleet.toml").law.holding()
+    # Of 4 m/s it may return 5 / (0.3 + sqrt(9.3) 4), and damps the rest.
+    share = 5.0 / (0.3 + sqrt(9.3) * 4.0)
+    assert strong.bounds(4.0).braking_m_s2 == pytest.approx(5.0 + (1.0 - share) * 4.0 / 0.7)
+    within = parse(changed(put("law.k_v", 1.0), put("law.hold_damping_s", 2.0)), "fleet.toml").law.holding()
+    assert within.bounds(4.0).braking_m_s2 == pytest.approx(hypot(4.3, sqrt(0.3) * 4.0))
+
+
 def test_the_returning_hold_follows_the_laws_own_pull_and_is_no_other_laws() -> None:
     config = parse(changed(put("law.k_v", 2.0), put("law.k_p", 0.5)), "fleet.toml")
-    assert config.law.holding() == ReturningHold(2.0, 0.5, 1.0, PlainHold("damped", 0.7))
+    assert config.law.holding() == ReturningHold(Pull(2.0, 0.5, 1.0, 5.0), PlainHold("damped", 0.7))
     tables = changed(put("law.kind", "paper"), put("law.hold", "returning"))
     with pytest.raises(ConfigError, match=r"law.hold.*'damped', 'zero' or 'first'.*'returning'"):
         parse(tables, "fleet.toml")

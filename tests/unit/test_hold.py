@@ -12,11 +12,11 @@ from companion.core.frames import Ned
 from companion.core.prediction import (
     PlainHold,
     PlainKind,
+    Pull,
     ReturningHold,
     Weights,
     axis,
     damped,
-    pulled,
     response,
     weights,
 )
@@ -123,8 +123,9 @@ def test_returning_hold_solves_its_differential_equation(
 
     solution = solve_ivp(rate, (start, start + tau_s), [p, v], rtol=1e-9, atol=1e-9)
     then, now = reference(start), reference(start + tau_s)
-    off, rate = pulled(p - then[0], v - then[1], 1.0, response(tau_s, k_v, k_p))
-    assert (now[0] + off, now[1] + rate) == pytest.approx(tuple(solution.y[:, -1]), abs=2e-5)
+    r, off, rate = response(tau_s, k_v, k_p), p - then[0], v - then[1]
+    held = now[0] + r.ee * off + r.ed * rate, now[1] + r.de * off + r.dd * rate
+    assert held == pytest.approx(tuple(solution.y[:, -1]), abs=2e-5)
 
 
 def state(p: Ned, v: Ned) -> PeerSample:
@@ -134,14 +135,13 @@ def state(p: Ned, v: Ned) -> PeerSample:
 PLACE = Reference(ZERO, ZERO, ZERO, 0.0)
 vectors = st.builds(Ned, values, values, values)
 velocities = st.builds(Ned, speeds, speeds, speeds)
+pulls = st.builds(Pull, gains, gains, st.floats(0.01, 5.0), st.floats(2.0, 20.0))
 
 
 @PROPERTY
-@given(vectors, velocities, gains, gains, st.floats(0.01, 5.0), st.floats(0.0, 30.0))
-def test_the_bounds_of_the_returning_hold_are_kept(
-    p: Ned, v: Ned, k_v: float, k_p: float, saturation_m: float, tau_s: float
-) -> None:
-    hold, step_s = ReturningHold(k_v, k_p, saturation_m, PlainHold("damped", 10.0)), 1e-4
+@given(vectors, velocities, pulls, st.floats(0.0, 30.0))
+def test_the_bounds_of_the_returning_hold_are_kept(p: Ned, v: Ned, pull: Pull, tau_s: float) -> None:
+    hold, step_s = ReturningHold(pull, PlainHold("damped", 0.7)), 1e-4
     bounds = hold.bounds(hypot(v.north, v.east))
     a, b = (hold.at(state(p, v), (ZERO, ZERO), PLACE, t).velocity_ned_m_s for t in (tau_s, tau_s + step_s))
     assert hypot(b.north - a.north, b.east - a.east) / step_s <= bounds.braking_m_s2 * (1.0 + 1e-6) + 1e-6
@@ -149,15 +149,16 @@ def test_the_bounds_of_the_returning_hold_are_kept(
 
 
 @PROPERTY
-@given(vectors, velocities, gains, gains, st.floats(0.01, 5.0))
-def test_what_is_beyond_the_saturation_stays_and_the_direction_is_kept(
-    p: Ned, v: Ned, k_v: float, k_p: float, saturation_m: float
-) -> None:
+@given(vectors, pulls)
+def test_what_is_beyond_the_saturation_and_the_limit_stays_and_the_direction_is_kept(p: Ned, pull: Pull) -> None:
     """Whoever stands far off is predicted to come as much nearer as one at the saturation, straight."""
-    hold = ReturningHold(k_v, k_p, saturation_m, PlainHold("damped", 0.7))
+    hold = ReturningHold(pull, PlainHold("damped", 0.7))
     held = hold.at(state(p, ZERO), (ZERO, ZERO), PLACE, 1e4).position_ned_m
     off_m = hypot(p.north, p.east)
-    left = max(off_m - saturation_m, 0.0) / max(off_m, 1e-12)
+    returns_m = min(off_m, pull.saturation_m) * min(1.0, pull.a_max_m_s2 / (pull.k_p * pull.saturation_m))
+    if off_m < pull.saturation_m:
+        returns_m = min(off_m, pull.a_max_m_s2 / pull.k_p)
+    left = (off_m - returns_m) / max(off_m, 1e-12)
     assert (held.north, held.east) == pytest.approx((left * p.north, left * p.east), abs=1e-6)
     assert held.down == p.down
 
@@ -166,7 +167,7 @@ def test_what_is_beyond_the_saturation_stays_and_the_direction_is_kept(
 @given(vectors, velocities, st.floats(0.0, 30.0))
 def test_where_no_motion_is_shared_and_along_the_vertical_it_is_the_damped_one(p: Ned, v: Ned, tau_s: float) -> None:
     plain = PlainHold("damped", 0.7)
-    hold, free = ReturningHold(1.0, 0.3, 1.0, plain), PLACE._replace(shared=False)
+    hold, free = ReturningHold(Pull(1.0, 0.3, 1.0, 5.0), plain), PLACE._replace(shared=False)
     assert hold.at(state(p, v), (ZERO, ZERO), free, tau_s) == plain.at(state(p, v), (ZERO, ZERO), free, tau_s)
     ours, theirs = (h.at(state(p, v), (ZERO, ZERO), PLACE, tau_s) for h in (hold, plain))
     assert (ours[0].down, ours[1].down) == (theirs[0].down, theirs[1].down)

@@ -151,9 +151,9 @@ def test_a_peer_that_lacks_the_newest_is_told_within_the_spread_unless_two_other
 def test_whether_a_peer_holds_a_newer_one_is_told_to_the_supervisor() -> None:
     one = One()
     one.hear(2, Phase.WAITING, at(NOW_NS), revision=4)
-    assert one.supervisor.outdated
+    assert one.supervisor.flight.outdated
     one.hear(2, Phase.WAITING, at(NOW_NS + SECOND_NS))
-    assert not one.supervisor.outdated
+    assert not one.supervisor.flight.outdated
 
 
 def test_who_comes_late_is_told_the_plan_once_there_is_one() -> None:

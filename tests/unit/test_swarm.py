@@ -19,7 +19,7 @@ from companion.core.law import starling as law
 from companion.core.law.base import Wanted
 from companion.core.law.paper import paper_gains
 from companion.core.neighbours.sample import predict_sample
-from companion.core.prediction import PlainHold, PlainKind, ReturningHold
+from companion.core.prediction import PlainHold, PlainKind, Pull, ReturningHold
 from companion.core.safety import avoidance
 from companion.core.safety import filter as safety
 from companion.core.trajectory.fleet import Reference
@@ -166,7 +166,7 @@ def test_the_returning_hold_that_is_flown_is_the_one_that_is_compiled(states: in
     """On one level: the swarm's law acts along the vertical too, and so does its hold."""
     rng = np.random.default_rng(states)
     setup = Setup(hold="returning", k_v=1.0, k_p=0.3)
-    hold = ReturningHold(1.0, 0.3, setup.saturation_m, PlainHold("damped", 0.7))
+    hold = ReturningHold(Pull(1.0, 0.3, setup.saturation_m, setup.a_max_m_s2), PlainHold("damped", setup.damping_s))
     limits = replace(load(FLEET).peer_limits, hold=hold)
     options, ig = run_options(setup), rules_of(setup)[1]
     out = np.zeros(12)
@@ -174,7 +174,7 @@ def test_the_returning_hold_that_is_flown_is_the_one_that_is_compiled(states: in
         ns = int(1e9 * rng.choice([0.0, 0.02, 1.0, 30.0]) * rng.random())
         scales = (20.0, 1.0, 5.0, rng.choice([0.3, 9.0]))
         centres, velocities, slot, off = (rng.normal(scale=x, size=(2, 3)) for x in scales)
-        sample = np.array([*(centres[0] + slot[0] + off[0]), *rng.normal(scale=1.5, size=3)])
+        sample = np.array([*(centres[0] + slot[0] + off[0]), *rng.normal(scale=rng.choice([1.5, 9.0]), size=3)])
         sample[2], sample[5] = centres[0, 2] + slot[0, 2], velocities[0, 2]
         table = np.hstack([centres, velocities, np.zeros((2, 3))])[:, None, :]
         predict(out, sample, 0, 1, 0, table, centres[1] + slot[0], options._replace(dt=ns * 1e-9), ig)

@@ -34,7 +34,7 @@ from companion.core.frames import Ned
 from companion.core.law.base import Wanted
 from companion.core.law.consensus import STEP_MAX_S, saturated
 from companion.core.law.starling import Gains, Sums, separation, total, within_budget
-from companion.core.prediction import Held, HoldBounds, axis, damped, response
+from companion.core.prediction import Held, HoldBounds, axis, damped, response, share_within
 from companion.core.trajectory.fleet import Reference
 from companion.core.values import Neighbour, PeerSample, VehicleState
 
@@ -107,10 +107,10 @@ class IntentHold:
     The intended place goes on as its anchor does. The state about it, (e, e'), goes back as the response says as far as
     the law's budget allows it to, and the rest as in the damped hold:
 
-        share = min(1, a_max / (k_p |e| + sqrt(k_d^2 + k_p) |e'|))
+        share = min(1, a_max / (k_p |e| + sqrt(k_d^2 + k_p) |e'|))      (`prediction.share_within`)
 
-    |e''| of the response is no more than that divisor while it lasts: by k_p e^2 + e'^2, which never grows, its four
-    weights are within 1, 1/sqrt(k_p), sqrt(k_p) and 1. The vertical is held damped.
+    By k_p e^2 + e'^2, which never grows, the response's four weights are within 1, 1/sqrt(k_p), sqrt(k_p) and 1. The
+    vertical is held damped.
     """
 
     gains: IntentGains
@@ -129,8 +129,7 @@ class IntentHold:
         north, east = north + p_now.north - p_then.north, east + p_now.east - p_then.east
         e = p.north - q_north, p.east - q_east
         rate = v.north - v_then.north - g_north, v.east - v_then.east - g_east
-        asked = g.k_p * hypot(*e) + sqrt(g.k_d * g.k_d + g.k_p) * hypot(*rate)
-        share = min(1.0, self.a_max_m_s2 / max(asked, 1e-12))
+        share = share_within(g.k_d, g.k_p, hypot(*e), hypot(*rate), self.a_max_m_s2)
         r, rest_share = response(tau_s, g.k_d, g.k_p), 1.0 - share
         ee, ed = share * r.ee + rest_share, share * r.ed + rest_share * w.position
         de, dd = share * r.de, share * r.dd + rest_share * w.velocity

@@ -44,7 +44,7 @@ MESSAGE_MAX_BYTES: Final = 1 << 20
 
 _SCOUTING_ADDRESS: Final = "224.0.0.224"
 _SCOUTING_PORTS: Final = range(20_000, 24_000)
-"""below Linux' ephemeral ports and clear of MAVLink's: 14540-14789, 18570-18819, 24540-24789, 25540-25789"""
+"""below Linux' ephemeral ports and clear of MAVLink's: 14540-14789, 18570-18819, 24540-25049, 25540-25789"""
 _RETRY: Final = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}
 _FLEET_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 

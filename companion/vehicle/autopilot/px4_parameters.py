@@ -141,7 +141,7 @@ class ParameterRows:
     def of(self, values: Mapping[str, float | int], missing: AbstractSet[str]) -> tuple[Check, ...]:
         """The rows of these parameters."""
         if self._known != (values, missing):
-            self._known = dict(values), set(missing)
             rows = parameter_checks(values, missing, self._config)
             self._rows = tuple(replace(row, vehicle=self._vehicle_id) for row in rows)
+            self._known = dict(values), set(missing)
         return self._rows

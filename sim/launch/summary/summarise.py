@@ -10,7 +10,7 @@ import numpy as np
 
 from companion.core.events import FailsafeActed, Killed
 from companion.wire.px4 import Px4Mode
-from sim.launch.summary.believed import STEP_NS, believed_errors, times_of
+from sim.launch.summary.believed import STEP_NS, believed_errors, estimate_errors, times_of
 from sim.launch.summary.believed import minimum_distance_m as believed_minimum_m
 from sim.launch.summary.criteria import criteria
 from sim.launch.summary.flight import TICK_ROWS, Command, Flight
@@ -86,6 +86,7 @@ def summarise(flight: Flight) -> dict[str, Any]:
             "minimum_distance_m": believed_minimum_m(flight, ids),
             "nearest_neighbour_m": rounded(float(every["nearest_m"].min())) if len(every) else None,
         },
+        "estimates": estimate_errors(flight, history, staying, formed, window, times, truth.position_ned_m[:, columns]),
         "setpoint_rate_hz": rounded(per_vehicle(float(every["steered"].sum()), ids, seconds)) if len(every) else None,
         "setpoint_gap_max_s": rounded(gap),
         "loop_lateness_ms": percentiles(every["lateness_ns"]),
