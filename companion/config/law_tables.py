@@ -76,8 +76,8 @@ class StarlingTable(LawTable):
         """See `LawTable`."""
         if self.hold == "returning" and self.k_v < RETURN_MIN_PER_S:
             yield (
-                f'$.law.k_v must be at least {RETURN_MIN_PER_S:g} 1/s with $.law.hold = "returning", which predicts that '
-                f'so a velocity fades, got {self.k_v:g}; or take hold = "damped"'
+                f'$.law.k_v must be at least {RETURN_MIN_PER_S:g} 1/s with $.law.hold = "returning", by which a '
+                f'predicted velocity fades so, got {self.k_v:g}; or take hold = "damped"'
             )
 
 

@@ -1,9 +1,9 @@
 """Real PX4 SITL instances (SIH quadrotor, headless) in the place of stubs: started, parametrised, watched, ended.
 
 PX4 takes instance numbers: instance i has system id i + 1 and speaks to UDP 14540 + i; past ten it would send all to
-14549, so those get another MAVLink link in its place by the port rule of `companion.config.endpoints`. The simulator's truth comes
-as HIL_STATE_QUATERNION on 19410 + i, the state of arming and mode over a link that each instance is told to open. The
-ground station's port, 14550, is left to a ground station.
+14549, so those get another MAVLink link in its place by the port rule of `companion.config.endpoints`. The simulator's
+truth comes as HIL_STATE_QUATERNION on 19410 + i, the state of arming and mode over a link that each instance is told to
+open. The ground station's port, 14550, is left to a ground station.
 """
 
 import os
