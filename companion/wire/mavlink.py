@@ -113,6 +113,12 @@ class ParameterValue(NamedTuple):
     value: float | int
 
 
+class ParameterError(NamedTuple):
+    """PARAM_ERROR (345), since PX4 v1.18: a parameter of that name is not there, or is not told."""
+
+    name: str
+
+
 class TimeAnswer(NamedTuple):
     """TIMESYNC (111) in answer to a request of ours."""
 
@@ -134,7 +140,7 @@ class HomePosition(NamedTuple):
 
 Event = (
     Heartbeat | LocalPosition | GlobalOrigin | CurrentMode | LandedState | EstimatorHealth | SystemHealth
-    | CommandAnswer | ParameterValue | TimeAnswer | SystemTime | HomePosition
+    | CommandAnswer | ParameterValue | ParameterError | TimeAnswer | SystemTime | HomePosition
 )  # fmt: skip
 
 
@@ -157,6 +163,7 @@ TIMESYNC = _layout(111, 34, "<qq")
 ESTIMATOR_STATUS = _layout(230, 163, "<QffffffffH")
 HOME_POSITION = _layout(242, 104, "<iii")
 EXTENDED_SYS_STATE = _layout(245, 130, "<BB")
+PARAM_ERROR = _layout(345, 209, "<hBB16sB")
 CURRENT_MODE = _layout(436, 193, "<II")
 
 
@@ -185,6 +192,7 @@ class MavlinkCodec:
                 (SYS_STATUS, _system_status),
                 (COMMAND_ACK, _command_answer),
                 (PARAM_VALUE, self._parameter),
+                (PARAM_ERROR, _parameter_error),
                 (TIMESYNC, _time_answer),
                 (SYSTEM_TIME, _system_time),
                 (HOME_POSITION, _home_position),
@@ -265,7 +273,7 @@ class MavlinkCodec:
         if not isfinite(value):
             self.rejected["not finite"] += 1
             return None
-        return ParameterValue(name.split(b"\0", 1)[0].decode("ascii", errors="replace"), value)
+        return ParameterValue(_text(name), value)
 
     # -- what it says -----------------------------------------------------------------------------------------------
 
@@ -318,6 +326,15 @@ def _estimator_status(_time_us: int, *fields: Any) -> EstimatorHealth:
 def _system_status(_present: int, _enabled: int, health: int, *fields: int) -> SystemHealth:
     charge = fields[-1]
     return SystemHealth(health, charge if 0 <= charge <= 100 else -1)
+
+
+def _parameter_error(_index: int, _system: int, component: int, name: bytes, error: int) -> ParameterError | None:
+    ours = component in (0, COMPANION_COMPONENT_ID)
+    return ParameterError(_text(name)) if ours and error else None
+
+
+def _text(name: bytes) -> str:
+    return name.split(b"\0", 1)[0].decode("ascii", errors="replace")
 
 
 def _command_answer(

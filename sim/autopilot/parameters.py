@@ -116,6 +116,8 @@ class ParameterTable:
 
     def __init__(self, overrides: Mapping[str, float | int], version: str = "1.16") -> None:
         own = defaults(version)
+        self.says_errors = version != "1.16"
+        """whether a request for what there is not gets PARAM_ERROR: since v1.18"""
         self._values = {name: _as_float32(v) if isinstance(v, float) else v for name, v in own.items()}
         for name, value in overrides.items():
             if name not in self._values:

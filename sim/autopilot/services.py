@@ -51,7 +51,7 @@ class Services:
         self.listing = [HASH_INDEX, *range(len(self._parameters))]
 
     def read_parameter(self, message: Any) -> None:
-        """PARAM_REQUEST_READ, by index or by name; silence on what there is not."""
+        """PARAM_REQUEST_READ, by index or by name; to what there is not PX4 answers since v1.18."""
         table = self._parameters
         if message.param_index >= 0:
             if message.param_index < len(table):
@@ -60,6 +60,13 @@ class Services:
             self._send_parameter(HASH_INDEX)
         elif message.param_id in table:
             self._send_parameter(table.index(message.param_id))
+        elif table.says_errors:
+            self._link.send(
+                mavlink.MAVLink_param_error_message(
+                    message.get_srcSystem(), message.get_srcComponent(), message.param_id.encode(), -1,
+                    mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST,
+                )
+            )  # fmt: skip
 
     def set_parameter(self, message: Any) -> bool:
         """PARAM_SET: a change is echoed twice, the same value once; False: refused in silence."""

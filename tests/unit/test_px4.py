@@ -519,6 +519,39 @@ def test_a_parameter_that_never_comes_is_missing_and_the_others_are_read() -> No
     assert one.client.parameters.missing == set()
 
 
+def says_error(one: Px4, name: str, seconds: float, component: int = 191, error: int = 1) -> None:
+    one.says(dialect.MAVLink_param_error_message(1, component, name.encode(), -1, error), seconds)
+
+
+def test_a_parameter_that_px4_says_it_has_not_is_missing_at_once_and_not_asked_for_again() -> None:
+    one = ready(10.0)
+    asked = answered(one, 10.0, 10.4, frozenset({"GF_ACTION"}))
+    for component, error in ((42, 1), (191, 0)):
+        says_error(one, "GF_ACTION", 10.4, component, error)  # somebody else's, and no error
+        assert one.client.parameters.missing == set()
+    says_error(one, "GF_ACTION", 10.45)
+    assert one.client.parameters.missing == {"GF_ACTION"}
+    asked += answered(one, 10.5, 14.0, frozenset({"GF_ACTION"}))
+    assert len([name for _, name in asked if name == "GF_ACTION"]) == 1
+    says_error(one, "COM_OF_LOSS_T", 14.0)  # asked for no more: it was read, and stays
+    assert "COM_OF_LOSS_T" in one.client.parameters.values
+
+
+@pytest.mark.parametrize("error_first", [True, False])
+def test_an_error_for_one_name_of_a_setting_is_no_fault_where_the_other_answers(error_first: bool) -> None:
+    one = ready(10.0)
+    gone = "COM_RC_OVERRIDE"
+    for k in range(150):
+        now = 10.0 + 0.01 * k
+        for name in sorted(asked_for(one.hear(now)), key=lambda n: (n == gone) is not error_first):
+            if name == gone:
+                says_error(one, name, now + 0.001)
+            else:
+                tells(one, name, 1.0 if name.startswith(("MPC", "COM_OF", "MAN")) else 4, now + 0.001)
+    assert one.client.parameters.missing == set()
+    assert set(one.client.parameters.values) == set(OF_1_18)
+
+
 def test_parameters_are_read_anew_on_the_ground_and_left_alone_in_flight() -> None:
     one = ready(10.0)
     answered(one, 10.0, 12.0)

@@ -98,6 +98,15 @@ def test_unknown_name_or_wrong_type_gets_no_answer_and_changes_nothing(
 
 def test_unknown_parameter_is_not_answered(flight: Flight) -> None:
     assert read(flight, "NO_SUCH_PARAM") == []
+    assert flight.of("PARAM_ERROR") == []
+
+
+def test_since_1_18_an_unknown_parameter_is_answered_by_an_error() -> None:
+    flight = Flight(px4_version="1.18")
+    flight.run(5.0)
+    assert read(flight, "NO_SUCH_PARAM") == []
+    (error,) = flight.of("PARAM_ERROR")
+    assert (error.param_id, error.error) == ("NO_SUCH_PARAM", mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST)
 
 
 def test_hash_changes_with_a_value(flight: Flight) -> None:

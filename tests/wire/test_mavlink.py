@@ -358,10 +358,13 @@ def as_pymavlink_reads(message: Any) -> list[wire.Event]:
             return [wire.ParameterValue(message.param_id, message.param_value)] if isfinite(message.param_value) else []
         case "PARAM_VALUE" if message.param_type == dialect.MAV_PARAM_TYPE_INT32:
             return [wire.ParameterValue(message.param_id, int.from_bytes(message.get_msgbuf()[10:14], "little"))]
+        case "PARAM_ERROR":
+            ours = message.target_component in (0, 191) and message.error
+            return [wire.ParameterError(message.param_id)] if ours else []
     return []
 
 
-ALL_READ = (0, 1, 2, 22, 32, 49, 77, 111, 230, 242, 245, 436)
+ALL_READ = (0, 1, 2, 22, 32, 49, 77, 111, 230, 242, 245, 345, 436)
 
 
 @settings(max_examples=1000, deadline=None)

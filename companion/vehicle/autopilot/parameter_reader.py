@@ -46,6 +46,12 @@ class ParameterReader:
                 self.missing.discard(other)
                 self._open.pop(other, None)
 
+    def refused(self, name: str) -> None:
+        """The autopilot says that it has none of that name: it is not asked for again in this round."""
+        if self._open.pop(name, None) is not None:
+            self.values.pop(name, None)
+            self.missing.add(name)
+
     def due(self, now_ns: int) -> list[str]:
         """Names to ask for now."""
         if not self._open and now_ns >= self._round_ns:

@@ -148,6 +148,8 @@ class Px4Autopilot:
                     self.home_altitude_amsl_m = message.altitude_amsl_m
                 case wire.ParameterValue():
                     self.parameters.take(message.name, message.value)
+                case wire.ParameterError():
+                    self.parameters.refused(message.name)
                 case wire.TimeAnswer():
                     if not self._round_trips.answered(message.asked_ns, now.monotonic_ns):
                         self.counts["time answer to nothing asked"] += 1
