@@ -41,6 +41,8 @@ class Px4Mode(IntEnum):
     AUTO_MISSION = 4 << 16 | 4 << 24
     AUTO_RTL = 4 << 16 | 5 << 24
     AUTO_LAND = 4 << 16 | 6 << 24
+    AUTO_DESCEND = 4 << 16 | 20 << 24
+    """since v1.19: a landing without a position"""
     ACRO = 5 << 16
     OFFBOARD = 6 << 16
     STABILIZED = 7 << 16

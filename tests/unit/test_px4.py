@@ -20,7 +20,7 @@ from companion.vehicle.autopilot.parameter_reader import (
     PARAMETER_TRIES,
     PARAMETERS_AT_ONCE,
 )
-from companion.vehicle.autopilot.port import OFFBOARD, FlightMode, Verb
+from companion.vehicle.autopilot.port import LAND, OFFBOARD, FlightMode, Verb
 from companion.vehicle.autopilot.px4 import Px4Autopilot
 from companion.vehicle.autopilot.px4_parameters import PARAMETERS
 from companion.vehicle.autopilot.requests import RETRY_S, TRIES
@@ -570,6 +570,14 @@ def test_a_reboot_forgets_the_parameters() -> None:
     answered(one, 100.0, 101.0)
     one.position(110.0, boot_ms=2_000)
     assert one.client.parameters.values == {}
+
+
+def test_a_descent_without_a_position_is_a_landing_like_any_other() -> None:
+    """PX4 v1.19 tells it as a mode of its own; one that was commanded to land is not taken over by it."""
+    one = ready(10.0)
+    one.heartbeat(10.1, armed=True, mode=Px4Mode.AUTO_DESCEND)
+    assert one.client.mode == LAND
+    assert one.client.mode_name == "AUTO_DESCEND"
 
 
 # -- round trip and the autopilot's clock ------------------------------------------------------------------------------

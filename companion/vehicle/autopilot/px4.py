@@ -50,6 +50,7 @@ MODES: dict[int, FlightMode] = {
     Px4Mode.AUTO_LOITER: HOLD,
     Px4Mode.OFFBOARD: OFFBOARD,
     Px4Mode.AUTO_LAND: LAND,
+    Px4Mode.AUTO_DESCEND: LAND,
 }
 """PX4's modes by the port's words; every other one goes by its own name"""
 REQUESTS = {
