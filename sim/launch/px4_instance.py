@@ -5,6 +5,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Mapping, Sequence
 from math import isfinite
 from pathlib import Path
@@ -22,6 +23,10 @@ STATE_PORT = 24800
 OFFBOARD_PORT = 14580
 """from which PX4's scripts have instance i speak to its companion: this plus i"""
 LAST_LINES = 5
+STARTED = "Startup script returned"
+"""what PX4 says once all its modules run"""
+STARTED_WITHIN_S = 10.0
+"""then it is tried whatever was said"""
 RUNNING = "already running for instance"
 """what PX4 says where its lock is taken"""
 
@@ -68,6 +73,7 @@ class Px4Instance:
         self.state_link = False
         """whether its state comes over a link of its own"""
         self._log = folder / "px4.log"
+        self._begun_s = time.monotonic()
         with self._log.open("wb") as log:
             self.process = subprocess.Popen(
                 [sys.executable, "-I", "-S", "-c", _END_WITH_PARENT, str(build / "bin" / "px4"), "-i", str(index),
@@ -79,9 +85,11 @@ class Px4Instance:
     def open_state_link(self, port: int) -> bool:
         """A link that tells arming and mode to that port, so that 14550 is left to a ground station.
 
-        Whether it is open: an instance that has just begun may not take commands yet.
+        Whether it is open: not before the instance has started. PX4 takes the command before that too, but a link that
+        is older than the simulation's clock falls silent when that is set.
         """
-        if not self.state_link:
+        started = STARTED in self._said or time.monotonic() - self._begun_s > STARTED_WITHIN_S
+        if not self.state_link and started:
             own, speed = str(STATE_PORT + self.index), ("-r", "4000000", "-f")
             self.state_link = self._mavlink("start", "-x", "-u", own, *speed, "-o", str(port)).returncode == 0
         return self.state_link

@@ -126,6 +126,9 @@ def test_a_build_whose_commands_cannot_be_run_is_told_and_one_that_hangs_is_aske
     (build / "bin" / "px4").chmod(0o755)
     instance = Px4Instance(249, Geodetic(47.4, 8.5, 488.0), build, tmp_path / "px4", {})
     instance.process.wait(10)
+    assert not instance.open_state_link(1), "it has not started"
+    with (tmp_path / "px4" / "px4.log").open("a") as log:
+        log.write("INFO  [px4] Startup script returned successfully\n")
     with pytest.raises(CompanionError, match=r"px4-mavlink: cannot be run: .*is the PX4 build whole"):
         instance.open_state_link(1)
     (build / "bin" / "px4-mavlink").write_text("#!/bin/sh\nexec sleep 5\n")
