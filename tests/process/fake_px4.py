@@ -1,15 +1,21 @@
 """A build folder whose `bin/px4` is a stub with a ground station's link: PX4's place in tests of its launcher."""
 
 import os
+import select
+import socket
 import sys
+import threading
 from pathlib import Path
 
 from companion.core.frames import Geodetic, Ned
 from sim.autopilot.parameters import defaults
 from sim.autopilot.stubs import StubFleetSettings, StubVehicleSettings, run_stubs
+from sim.launch.px4_instance import STARTED, STATE_PORT
 
 ROOT = Path(__file__).resolve().parents[2]
 HERE = Path(__file__).resolve().parent
+GROUND_PORT, GROUND_PORT_OF_INSTANCE = 14550, 18570
+LINK = b"link to "
 VERSION = "FAKE_PX4_VERSION"
 """environment: whose parameters it has"""
 
@@ -18,13 +24,41 @@ def fake_build(folder: Path) -> Path:
     """A folder that passes for PX4's build/px4_sitl_default."""
     (folder / "bin").mkdir(parents=True)
     (folder / "etc").mkdir()
-    program = folder / "bin" / "px4"
-    program.write_text(
-        f"#!{sys.executable}\nimport sys\nsys.path[:0] = {[str(ROOT), str(HERE)]!r}\n"
-        "from fake_px4 import main\nmain()\n"
-    )
-    program.chmod(0o755)
+    for name, function in (("px4", "main"), ("px4-mavlink", "open_link")):
+        program = folder / "bin" / name
+        program.write_text(
+            f"#!{sys.executable}\nimport sys\nsys.path[:0] = {[str(ROOT), str(HERE)]!r}\n"
+            f"from fake_px4 import {function}\n{function}()\n"
+        )
+        program.chmod(0o755)
     return folder
+
+
+def open_link() -> None:
+    """`px4-mavlink --instance N start ... -u OWN ... -o PORT`."""
+    own, port = (sys.argv[sys.argv.index(word) + 1] for word in ("-u", "-o"))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as s:
+        s.sendto(LINK + port.encode(), ("127.0.0.1", int(own)))
+
+
+def _relay(index: int) -> None:
+    """The stub's link to a ground station, as one on a port of its own to whoever asked for it last."""
+    link, ground = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
+    link.bind(("127.0.0.1", STATE_PORT + index))
+    ground.bind(("127.0.0.1", GROUND_PORT))
+    port: int | None = None
+    while True:
+        ready, _, _ = select.select([link, ground], [], [])
+        if link in ready:
+            datagram = link.recv(2048)
+            if datagram.startswith(LINK):
+                port = int(datagram.removeprefix(LINK))
+            else:
+                ground.sendto(datagram, ("127.0.0.1", GROUND_PORT_OF_INSTANCE + index))
+        if ground in ready:
+            datagram = ground.recv(2048)
+            if port is not None:
+                link.sendto(datagram, ("127.0.0.1", port))
 
 
 def main() -> None:
@@ -39,4 +73,6 @@ def main() -> None:
         index + 1, index + 1, 14580 + index, 14540 + index, Ned(0.0, 0.0, 0.0), instance=index,
         parameters=tuple(parameters.items()), px4_version=version,
     )  # fmt: skip
+    threading.Thread(target=_relay, args=(index,), daemon=True).start()
+    print(STARTED, flush=True)  # noqa: T201 (as PX4 does)
     run_stubs(StubFleetSettings((vehicle,), home, ground=True))

@@ -201,6 +201,7 @@ def test_the_summary_shows_no_control_characters(text: str) -> None:
         ),
         text,
     )  # fmt: skip
+    estimates = {"formation_error_decorrelated_rms_m": None}
     steady: dict[str, Any] = dict.fromkeys(
         (
             "formation_error_rms_m", "seconds", "velocity_error_rms_m_s", "centroid_error_rms_m",
@@ -215,7 +216,8 @@ def test_the_summary_shows_no_control_characters(text: str) -> None:
         "unanswered": [2],
     }  # fmt: skip
     summary |= {
-        "steady": steady, "latency_ms": none, "loop_lateness_ms": none, "reference_lateness_ms": none,
+        "steady": steady,
+        "estimates": estimates, "latency_ms": none, "loop_lateness_ms": none, "reference_lateness_ms": none,
         "killed": {1: text}, "failsafes": [text], "lost": [1], "unrecorded": {1: text}, "autopilots_lost": {1: text},
         "missing": {1: text}, "rejected": {text: 1}, "folder": text, "commands": [order], "passed": False,
         "criteria": [{"what": text, "limit": text, "value": text, "met": False}],

@@ -113,6 +113,7 @@ def test_one_that_flees_is_told_as_that_before_its_failsafes() -> None:
 
 def test_the_summary_shows_who_commanded_what_and_who_was_killed(capsys: pytest.CaptureFixture[str]) -> None:
     none = {"p50": None, "p99": None}
+    estimates = {"formation_error_decorrelated_rms_m": None}
     steady = dict.fromkeys(
         (
             "formation_error_rms_m", "seconds", "velocity_error_rms_m_s", "centroid_error_rms_m",
@@ -123,7 +124,8 @@ def test_the_summary_shows_who_commanded_what_and_who_was_killed(capsys: pytest.
     )  # fmt: skip
     show_summary(
         {
-            "vehicles": 3, "formed_after_s": 20.0, "minimum_distance_m": 3.0, "steady": steady, "latency_ms": none,
+            "vehicles": 3, "formed_after_s": 20.0, "minimum_distance_m": 3.0, "steady": steady,
+            "estimates": estimates, "latency_ms": none,
             "loop_lateness_ms": none, "reference_lateness_ms": none, "cpu_per_tick_ms": None,
             "setpoint_gap_max_s": 0.1, "touchdown_max_m_s": 12.6, "killed": {3: "killed by command"}, "failsafes": [],
             "lost": [], "unrecorded": {}, "autopilots_lost": {2: "PX4 ended with status -9"}, "rejected": {},
