@@ -135,7 +135,7 @@ def response(tau_s: float, k_d: float, k_p: float) -> Response:
 
 
 class Pull(NamedTuple):
-    """How a law pulls a vehicle back to the plan: its gains and limits."""
+    """How a law pulls a vehicle back to its place: its gains and limits."""
 
     k_v: float
     """1/s"""
@@ -155,7 +155,7 @@ def share_within(k_d: float, k_p: float, off_m: float, rate_m_s: float, a_max_m_
 
 
 def returning(tau_s: float, off_m: float, rate_m_s: float, pull: Pull, damped: Weights) -> Response:
-    """The response to the plan's pull from that far off and that fast, relative to the plan.
+    """The response to the pull from that far off and that fast, relative to the place and its motion.
 
     What is beyond the law's saturation stays where it is; what is beyond its limit is damped.
     """
@@ -191,7 +191,7 @@ class PlainHold:
 
     def at(self, sample: PeerSample, then: tuple[Ned, Ned], now: Reference, tau_s: float) -> Held:
         """See `Hold`."""
-        w = damped(tau_s, self.damping_s) if self.kind == "damped" else weights(self.kind, tau_s, self.damping_s)
+        w = weights(self.kind, tau_s, self.damping_s)
         p, v = sample.position_ned_m, sample.velocity_ned_m_s
         then_p, then_v = then
         now_p, now_v = now.position_ned_m, now.velocity_ned_m_s

@@ -158,12 +158,10 @@ class Companion:
         ready = self._wait_until(deadline_ns)
         if self.link in ready:
             self._receive_mavlink()
-        requests: list[Request] = []
-        if self._wake_read in ready:
+        woken = self._wake_read in ready
+        if woken:
             self._wake_read.recv(4096)
-            requests = self._receive_from_peers()
-        elif self._drain_failed:
-            requests = self._receive_from_peers()
+        requests = self._receive_from_peers() if woken or self._drain_failed else []
         self._heed_stops(ready)
         self._advance(deadline_ns)
         for request in sorted(requests, key=lambda r: r.kind != "command"):

@@ -44,15 +44,12 @@ LOG_BACKEND = "SDLOG_BACKEND"
 
 def find_build(given: Path | None) -> Path:
     """The folder that is given, or one of PLACES; CompanionError says what it needs to hold and how to get it."""
-    if given is not None:
-        if not _is_build(given):
-            raise CompanionError(f"--px4 {given}: is no PX4 build folder (needs bin/px4 and etc/). {HOW_TO_GET}")
-        return given.resolve()
     named = os.environ.get("PX4_BUILD")
-    if named:
-        if not _is_build(Path(named)):
-            raise CompanionError(f"PX4_BUILD={named}: is no PX4 build folder (needs bin/px4 and etc/). {HOW_TO_GET}")
-        return Path(named).resolve()
+    said, build = (f"PX4_BUILD={named}", Path(named)) if given is None and named else (f"--px4 {given}", given)
+    if build is not None:
+        if not _is_build(build):
+            raise CompanionError(f"{said}: is no PX4 build folder (needs bin/px4 and etc/). {HOW_TO_GET}")
+        return build.resolve()
     places = [Path(place).expanduser() for place in PLACES]
     found = next((place for place in places if _is_build(place)), None)
     if found is None:

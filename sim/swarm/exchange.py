@@ -5,7 +5,7 @@ import math
 
 from companion.core.law.base import FIELDS_MAX
 from companion.core.law.intent import IntentGains, IntentTrigger
-from companion.core.prediction import Pull, Weights
+from companion.core.prediction import Weights
 from companion.core.trigger.error import ErrorTrigger
 from companion.core.trigger.switching import SwitchingTrigger
 from companion.core.values import CommonMotion
@@ -90,8 +90,7 @@ def predict(
         for k in range(3):
             off2 += (sample[k] - slot[k] + ref[now, m, k] - ref[then, m, k]) ** 2
             rate2 += (sample[3 + k] - ref[then, m, 3 + k]) ** 2
-        pull = Pull(o.hold_k_v, o.hold_k_p, o.hold_saturation, o.hold_a_max)
-        r = returning(tau, math.sqrt(off2), math.sqrt(rate2), pull, w)
+        r = returning(tau, math.sqrt(off2), math.sqrt(rate2), o.pull, w)
         for k in range(3):
             off = sample[k] - slot[k] + ref[now, m, k] - ref[then, m, k]
             rate = sample[3 + k] - ref[then, m, 3 + k]

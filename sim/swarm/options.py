@@ -11,6 +11,7 @@ import numpy as np
 from companion.config.bounds import SPACING_MARGIN_M
 from companion.core.law.intent import IntentGains, IntentTrigger
 from companion.core.law.starling import Gains
+from companion.core.prediction import Pull
 from companion.core.trigger.error import ErrorTrigger
 from companion.core.trigger.near import HOLD_S as NEAR_HOLD_S
 from companion.core.trigger.near import near_bound_m
@@ -88,10 +89,7 @@ def run_options(setup: Setup) -> Options:
         every=setup.control_every,
         hold=_HOLDS[setup.hold],
         damping=setup.damping_s,
-        hold_k_v=setup.k_v,
-        hold_k_p=setup.k_p,
-        hold_saturation=setup.saturation_m,
-        hold_a_max=setup.a_max_m_s2,
+        pull=Pull(setup.k_v, setup.k_p, setup.saturation_m, setup.a_max_m_s2),
         trigger=_TRIGGERS[setup.trigger],
         t_min=setup.t_min_s,
         t_max=setup.t_max_s,

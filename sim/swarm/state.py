@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from companion.core.law.base import FIELDS_MAX
+from companion.core.prediction import Pull
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -39,11 +40,8 @@ class Options(NamedTuple):
     """steps per control period"""
     hold: int
     damping: float
-    hold_k_v: float
+    pull: Pull
     """of the returning hold: the law's"""
-    hold_k_p: float
-    hold_saturation: float
-    hold_a_max: float
     trigger: int
     t_min: float
     t_max: float

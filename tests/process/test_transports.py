@@ -216,6 +216,25 @@ class FailingTransport(MemoryTransport):
 
 
 @pytest.mark.process
+@pytest.mark.timeout(60)
+def test_what_waits_at_a_transport_that_failed_is_asked_for_again_though_nothing_more_comes(tmp_path: Path) -> None:
+    fleet, bus = make_fleet(tmp_path, 1), Bus()
+    settings = RunSettings(1, log=lambda _: None)
+    with ExitStack() as stack:
+        alone = Companion(fleet.config, settings, {}, lambda wake: FailingTransport(bus, 1, wake))
+        thread = threading.Thread(target=alone.run)
+        for at_last in (alone.close, thread.join, alone.ask_to_stop, alone.ask_to_stop):
+            stack.callback(at_last)
+        thread.start()
+        operator = MemoryOperatorLink(bus)
+        assert operator.ask_timed([1], "status", b"", timeout_s=5.0, retry_s=5.0)[1], "it runs"
+        alone.network.failing.update(drain=3)  # type: ignore[attr-defined]
+        asked = operator.ask_timed([1], "status", b"", timeout_s=5.0, retry_s=100.0)
+        assert asked[1] is not None
+        assert alone.guard.raised["transport drain: RuntimeError"] == 3
+
+
+@pytest.mark.process
 @pytest.mark.timeout(200)
 def test_three_companions_in_one_process_fly_on_the_transport_in_memory(tmp_path: Path) -> None:
     """The loop itself: no process, signal or Zenoh session around it, stubs for autopilots."""

@@ -27,14 +27,14 @@ per equation, as in `law`; the swarm compiles these. A vehicle flies them by `In
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import exp, hypot, sqrt
+from math import exp, hypot, inf, sqrt
 from typing import NamedTuple
 
 from companion.core.frames import Ned
 from companion.core.law.base import Wanted
 from companion.core.law.consensus import STEP_MAX_S, saturated
 from companion.core.law.starling import Gains, Sums, separation, total, within_budget
-from companion.core.prediction import Held, HoldBounds, axis, damped, response, share_within
+from companion.core.prediction import Held, HoldBounds, Pull, axis, damped, returning
 from companion.core.trajectory.fleet import Reference
 from companion.core.values import Neighbour, PeerSample, VehicleState
 
@@ -105,9 +105,7 @@ class IntentHold:
     """`core.prediction.Hold` of this law.
 
     The intended place goes on as its anchor does. The state about it, (e, e'), goes back as the response says as far as
-    the law's budget allows it to, and the rest as in the damped hold:
-
-        share = min(1, a_max / (k_p |e| + sqrt(k_d^2 + k_p) |e'|))      (`prediction.share_within`)
+    the law's budget allows it to, and the rest as in the damped hold (`prediction.returning`).
 
     By k_p e^2 + e'^2, which never grows, the response's four weights are within 1, 1/sqrt(k_p), sqrt(k_p) and 1. The
     vertical is held damped.
@@ -129,10 +127,7 @@ class IntentHold:
         north, east = north + p_now.north - p_then.north, east + p_now.east - p_then.east
         e = p.north - q_north, p.east - q_east
         rate = v.north - v_then.north - g_north, v.east - v_then.east - g_east
-        share = share_within(g.k_d, g.k_p, hypot(*e), hypot(*rate), self.a_max_m_s2)
-        r, rest_share = response(tau_s, g.k_d, g.k_p), 1.0 - share
-        ee, ed = share * r.ee + rest_share, share * r.ed + rest_share * w.position
-        de, dd = share * r.de, share * r.dd + rest_share * w.velocity
+        ee, ed, de, dd = returning(tau_s, hypot(*e), hypot(*rate), Pull(g.k_d, g.k_p, inf, self.a_max_m_s2), w)
         down, v_down = axis(p.down, v.down, p_then.down, v_then.down, p_now.down, v_now.down, w)
         return Held(
             Ned(north + ee * e[0] + ed * rate[0], east + ee * e[1] + ed * rate[1], down),

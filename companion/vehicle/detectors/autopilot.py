@@ -71,9 +71,7 @@ def mode_is_foreign(flight: Flight) -> bool:
         case Phase.LANDING if flight.land_seen:
             # On disarming PX4 falls back to the mode before, which the heartbeat tells a second later.
             return mode not in (LAND, OFFBOARD, before) and not flight.autopilot.on_ground
-        case Phase.LANDING:
-            return mode not in (*ON_THE_WAY_UP, LAND, before)
-    return mode != OFFBOARD
+    return mode not in (*ON_THE_WAY_UP, LAND, before)
 
 
 class NotArmed(Detector):
