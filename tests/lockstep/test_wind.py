@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from flights import errors, failsafes, fleet, straight, truth, wait
+from flights import distances, errors, failsafes, fleet, straight, truth, until_landed, wait
 
 from companion.core.values import Phase
 from sim.lockstep.lockstep import Lockstep
@@ -65,3 +65,22 @@ def test_who_is_predicted_to_stay_downwind_holds_the_others_there() -> None:
     damped = flown("damped", *WINDS["tail"])
     assert damped.formed_s >= 1.4 * flown("returning", *WINDS["tail"]).formed_s
     assert damped.centroid_m >= 2.0 * flown("returning", *WINDS["tail"]).centroid_m
+
+
+def test_a_storm_that_no_vehicle_can_stand_against_brings_nobody_together_and_all_land_on_command() -> None:
+    """12 m/s push with 12 m/s^2, more than the tilt gives: all are carried off, as one."""
+
+    def change(tables: dict[str, dict[str, object]]) -> None:
+        tables["stub"] |= {"drag_per_s": DRAG_PER_S, "wind_north_m_s": 12.0}
+
+    ls = Lockstep(fleet(5, legs=straight(60.0), change=change), seed=1)
+    ls.run_until_ready(20.0)
+    begun_s = ls.now_ns * 1e-9
+    ls.command(b'{"verb":"takeoff"}')
+    wait(ls, LIMIT_S)
+    assert not ls.all_in(Phase.FORMED)
+    ls.command(b'{"verb":"land"}')
+    until_landed(ls)
+    t = truth(ls, begun_s)
+    assert np.abs(t.position_ned_m[:, :, 0]).max() > 50.0, "they were carried off"
+    assert distances(t).min() >= 1.5
