@@ -47,6 +47,9 @@ def up(
         Path | None, typer.Option(help="With --autopilot px4: its build folder, or /opt/px4; else looked for.")
     ] = None,
     parameter: Parameters = None,
+    logs: Annotated[
+        bool, typer.Option("--logs", help="With --autopilot px4: keep each PX4's flight log (ULog, 25 MB a minute).")
+    ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Seed of gusts, noise and estimator origins.")] = 0,
     calm: Annotated[bool, typer.Option("--calm", help="No gusts, no wind and no sensor noise.")] = False,
     gcs: Annotated[
@@ -82,6 +85,8 @@ def up(
     parse_parameters(parameter or ())
     if parameter and autopilot != "px4":
         raise ConfigError("--parameter is for the instances of --autopilot px4")
+    if logs and autopilot != "px4":
+        raise ConfigError("--logs is for the instances of --autopilot px4: companions record whatever flies")
     if autopilot == "px4":
         px4 = find_build(px4)
 
@@ -112,7 +117,7 @@ def up(
         refuse_companions(config)
         options = FlightOptions(
             flight_folder(out), seed, duration, px4, tuple(parameter or ()), autopilot == "external", gcs, faults,
-            allow_missing,
+            allow_missing, logs=logs,
         )  # fmt: skip
         with FlightView(quiet=as_json) as view:
             summary = fly(tables, options, view.show, interrupted, lambda line: tell(line, error=True))
@@ -194,6 +199,7 @@ def sitl(
     fleet: FleetFile = FLEET_TOML,
     parameter: Parameters = None,
     ready: Annotated[Path | None, typer.Option(help="A file to make once every parameter is read back.")] = None,
+    logs: Annotated[bool, typer.Option("--logs", help="Have the instances write their flight logs.")] = False,
 ) -> None:
     """Run PX4 SITL instances until standard input closes: for launchers."""
     from companion.config.overrides import fleet_config
@@ -203,7 +209,9 @@ def sitl(
 
     config = fleet_config(fleet)
     parameters = parse_parameters(parameter or ())
-    settings = SitlSettings(find_build(px4), truth.parent, truth, sys.stdin.fileno(), parameters, ready)
+    settings = SitlSettings(
+        find_build(px4), truth.parent, truth, sys.stdin.fileno(), parameters, logs=logs, ready_path=ready
+    )
     SitlHost(config, settings).run(grace_s=1.5)
 
 

@@ -231,8 +231,8 @@ class StubTable(Table):
     origin_scatter_m: NotNegative = 5.0
     """how far each estimator's origin lies from its vehicle's pad"""
     dynamics: Literal["px4", "ideal"] = "px4"
-    px4_version: Literal["1.16", "1.18"] = "1.16"
-    """whose parameters the stubs have"""
+    px4: Literal["1.16", "1.17", "1.18", "main"] = "1.16"
+    """which PX4 the stubs play: its parameters, modes and answers"""
 
 
 class VehicleTable(Table):

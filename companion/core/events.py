@@ -113,6 +113,14 @@ class AutopilotRebooted:
 
 
 @dataclass(frozen=True, slots=True)
+class AutopilotIdentified:
+    """The autopilot has told what it is."""
+
+    software: str
+    """its name and version"""
+
+
+@dataclass(frozen=True, slots=True)
 class OriginMoved:
     """The autopilot's estimator has another origin."""
 
@@ -135,8 +143,8 @@ class RequestUnanswered:
 
 Event = (
     PhaseChanged | MotionAdopted | FailsafeActed | FailsafeNoted | PeerDoubted | GraphNearBreaking | NoWayBack
-    | KillCommanded | KillGivenUp | Killed | ResumeGivenUp | AutopilotRebooted | OriginMoved | RequestRefused
-    | RequestUnanswered
+    | KillCommanded | KillGivenUp | Killed | ResumeGivenUp | AutopilotRebooted | AutopilotIdentified | OriginMoved
+    | RequestRefused | RequestUnanswered
 )  # fmt: skip
 
 
@@ -167,6 +175,8 @@ def sentence(event: Event) -> str:
             return f"resume given up: the autopilot stays in {mode}"
         case AutopilotRebooted():
             return "autopilot rebooted"
+        case AutopilotIdentified(software):
+            return f"autopilot is {software}"
         case OriginMoved():
             return "estimator origin moved"
         case RequestRefused(request, result):

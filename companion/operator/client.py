@@ -62,7 +62,7 @@ class Answers:
     outdated: tuple[int, ...] = ()
     """who refused since it has gone on: another place in the order of commands, a newer motion"""
     notes: tuple[str, ...] = ()
-    """who was left out, and why"""
+    """who was left out and why; what preflight warns of"""
 
     @property
     def all_accepted(self) -> bool:
@@ -162,7 +162,8 @@ class Operator:
         if not report.fit:
             raise PreflightError(report)
         self.status()
-        return self.command("takeoff")
+        answers = self.command("takeoff")
+        return replace(answers, notes=(*answers.notes, *(f"warning: {w}" for w in report.warnings)))
 
     def land(self, vehicle: int | None = None) -> Answers:
         """Every vehicle, or one, lands where it is."""

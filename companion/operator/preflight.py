@@ -19,7 +19,8 @@ from companion.core.trajectory_check import ALTITUDE_MIN_M, PLAN_SPEED_SHARE, SP
 from companion.core.values import ZERO
 from companion.operator.clocks import ClockOffset
 from companion.operator.ways import change_distances_m, level_distance_m, ways_apart_m
-from companion.wire.operator import Check, PreflightReport, tidy, unmet
+from companion.terminal import one_line
+from companion.wire.operator import Check, PreflightReport, tidy, unmet, warnings
 
 BODY_M = 0.5
 """closer than this two vehicles touch; what is kept where the barrier is off"""
@@ -48,9 +49,18 @@ class FleetReport:
         """Each fault as a sentence that names vehicle, value and limit."""
         return [c.sentence() for c in unmet(self.checks)]
 
+    @property
+    def warnings(self) -> list[str]:
+        """What is no fault and yet worth a word, each sentence once with the vehicles that it is said of."""
+        vehicles: dict[str, list[str]] = {}
+        for c in warnings(self.checks):
+            vehicles.setdefault(one_line(c.message), []).append(str(c.vehicle))
+        return [f"vehicle {', '.join(ids)}: {says}" for says, ids in vehicles.items()]
+
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
-        return {"fit": self.fit, "faults": self.faults, "checks": [asdict(c) for c in self.checks]}
+        rows = [asdict(c) for c in self.checks]
+        return {"fit": self.fit, "faults": self.faults, "warnings": self.warnings, "checks": rows}
 
 
 def fleet_report(

@@ -157,11 +157,14 @@ def show_preflight(report: FleetReport, explain: bool) -> None:
         for c in report.checks:
             table.add_row(
                 str(c.vehicle) if c.vehicle else "fleet", *(Text(one_line(t)) for t in (c.name, _value(c), c.limit)),
+                Text("see below", style="yellow") if c.passed and c.warns else
                 Text("met", style="green") if c.passed else Text("NOT MET", style="red"),
             )  # fmt: skip
         console.print(table)
     for fault in report.faults:
         console.print(Text(printable(fault), style="red"), soft_wrap=True)
+    for warning in report.warnings:
+        console.print(Text(printable(f"warning: {warning}"), style="yellow"), soft_wrap=True)
     fit = f"fit for take-off: {len(report.checks)} checks met"
     console.print(fit if report.fit else f"not fit for take-off: {len(report.faults)} of {len(report.checks)} checks")
 

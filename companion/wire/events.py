@@ -28,6 +28,7 @@ KINDS: dict[str, type[Event]] = {
     "killed": events.Killed,
     "resume given up": events.ResumeGivenUp,
     "autopilot rebooted": events.AutopilotRebooted,
+    "autopilot identified": events.AutopilotIdentified,
     "origin moved": events.OriginMoved,
     "request refused": events.RequestRefused,
     "request unanswered": events.RequestUnanswered,

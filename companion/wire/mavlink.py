@@ -23,7 +23,7 @@ from companion.wire.mavlink_frames import (
     frames_of,
     is_one_frame,
 )
-from companion.wire.px4 import PARAMETER_INT32, PARAMETER_REAL32, parameter_value
+from companion.wire.px4 import PARAMETER_INT32, PARAMETER_REAL32, Software, parameter_value, software
 
 COMPANION_COMPONENT_ID = 191
 AUTOPILOT_COMPONENT_ID = 1
@@ -140,7 +140,7 @@ class HomePosition(NamedTuple):
 
 Event = (
     Heartbeat | LocalPosition | GlobalOrigin | CurrentMode | LandedState | EstimatorHealth | SystemHealth
-    | CommandAnswer | ParameterValue | ParameterError | TimeAnswer | SystemTime | HomePosition
+    | CommandAnswer | ParameterValue | ParameterError | TimeAnswer | SystemTime | HomePosition | Software
 )  # fmt: skip
 
 
@@ -160,6 +160,7 @@ COMMAND_LONG = _layout(76, 152, "<fffffffHBBB")
 COMMAND_ACK = _layout(77, 143, "<HBBiBB")
 SET_POSITION_TARGET_LOCAL_NED = _layout(84, 143, "<IfffffffffffHBBB")
 TIMESYNC = _layout(111, 34, "<qq")
+AUTOPILOT_VERSION = _layout(148, 178, "<QQIIIIHH8s")
 ESTIMATOR_STATUS = _layout(230, 163, "<QffffffffH")
 HOME_POSITION = _layout(242, 104, "<iii")
 EXTENDED_SYS_STATE = _layout(245, 130, "<BB")
@@ -196,6 +197,7 @@ class MavlinkCodec:
                 (TIMESYNC, _time_answer),
                 (SYSTEM_TIME, _system_time),
                 (HOME_POSITION, _home_position),
+                (AUTOPILOT_VERSION, _autopilot_version),
             )
         }
 
@@ -331,6 +333,13 @@ def _system_status(_present: int, _enabled: int, health: int, *fields: int) -> S
 def _parameter_error(_index: int, _system: int, component: int, name: bytes, error: int) -> ParameterError | None:
     ours = component in (0, COMPANION_COMPONENT_ID)
     return ParameterError(_text(name)) if ours and error else None
+
+
+def _autopilot_version(
+    _capabilities: int, _uid: int, flight_sw: int, _middleware: int, _os: int, _board: int, _vendor: int, _product: int,
+    flight_custom: bytes,
+) -> Software:  # fmt: skip
+    return software(flight_sw, flight_custom)
 
 
 def _text(name: bytes) -> str:

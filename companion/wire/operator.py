@@ -215,11 +215,13 @@ class Check:
     """what is allowed, with its unit"""
     passed: bool
     message: _Text
-    """the fault as a sentence; of no meaning when passed"""
+    """the fault, or what is worth a word, as a sentence; of no meaning where it is neither"""
     permanent: bool = False
     """whether it cannot come right by waiting"""
     vehicle: _SystemId = 0
     """whose; 0: the fleet's"""
+    warns: bool = False
+    """met, and yet an operator should read the message"""
 
     def sentence(self) -> str:
         """The fault with the name of whose it is."""
@@ -272,6 +274,11 @@ def tidy(value: float | int | None) -> float | int | str | None:
 def unmet(checks: Iterable[Check]) -> list[Check]:
     """The rows that are not met."""
     return [c for c in checks if not c.passed]
+
+
+def warnings(checks: Iterable[Check]) -> list[Check]:
+    """The rows that are met and yet worth a word."""
+    return [c for c in checks if c.passed and c.warns]
 
 
 Spoken = Command | Answer | Status | PreflightReport | ClockReading

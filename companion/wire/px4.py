@@ -3,6 +3,7 @@
 import struct
 from enum import IntEnum
 from math import nan
+from typing import NamedTuple
 
 AUTOPILOT_PX4 = 12
 """MAV_AUTOPILOT"""
@@ -10,7 +11,7 @@ MULTICOPTERS = frozenset({2, 3, 4, 13, 14, 15, 29})
 """MAV_TYPE: quadrotor, coaxial, helicopter, hexarotor, octorotor, tricopter, dodecarotor"""
 PARAMETER_INT32, PARAMETER_REAL32 = 6, 9
 """MAV_PARAM_TYPE"""
-ORIGIN_MESSAGE_ID = 49
+ORIGIN_MESSAGE_ID, VERSION_MESSAGE_ID = 49, 148
 POSITION_MESSAGE_ID = 32
 STREAMS_HZ = {436: 20.0, 245: 5.0, 230: 1.0, 1: 1.0, 2: 1.0, 242: 0.5}
 """what the companion asks for with SET_MESSAGE_INTERVAL, beside the positions"""
@@ -42,7 +43,7 @@ class Px4Mode(IntEnum):
     AUTO_RTL = 4 << 16 | 5 << 24
     AUTO_LAND = 4 << 16 | 6 << 24
     AUTO_DESCEND = 4 << 16 | 20 << 24
-    """since v1.19: a landing without a position"""
+    """a landing without a position, of versions that have it as a mode of its own"""
     ACRO = 5 << 16
     OFFBOARD = 6 << 16
     STABILIZED = 7 << 16
@@ -55,6 +56,39 @@ def mode_name(custom_mode: int) -> str:
         return Px4Mode(custom_mode).name
     except ValueError:
         return f"{custom_mode:#x}"
+
+
+FIRMWARE_TYPES = {0: "dev", 64: "alpha", 128: "beta", 192: "rc", 255: ""}
+"""FIRMWARE_VERSION_TYPE; 255: a release"""
+
+
+class Software(NamedTuple):
+    """What AUTOPILOT_VERSION (148) tells of the flight software."""
+
+    major: int
+    minor: int
+    patch: int
+    kind: int
+    """FIRMWARE_VERSION_TYPE"""
+    git: str
+    """first digits of the build's commit; empty where none is told"""
+
+    @property
+    def number(self) -> tuple[int, int]:
+        """Without the patch, which changes no behaviour."""
+        return self.major, self.minor
+
+    def __str__(self) -> str:
+        kind = FIRMWARE_TYPES.get(self.kind, f"type {self.kind}")
+        number = "-".join(x for x in (f"{self.major}.{self.minor}.{self.patch}", kind) if x)
+        return f"{number} ({self.git})" if self.git else number
+
+
+def software(flight_sw_version: int, flight_custom_version: bytes) -> Software:
+    """From AUTOPILOT_VERSION's fields; PX4 has the commit's first eight bytes there, the last of them first."""
+    major, minor, patch, kind = flight_sw_version.to_bytes(4, "big")
+    git = flight_custom_version[::-1].hex()[:10] if any(flight_custom_version) else ""
+    return Software(major, minor, patch, kind, git)
 
 
 def parameter_value(raw: bytes, kind: int) -> float | int:

@@ -13,6 +13,7 @@ os.environ["MAVLINK20"] = "1"
 from pymavlink.dialects.v20 import development as mavlink
 
 from companion.core.frames import Geodetic, Ned, ned_to_geodetic
+from companion.vehicle.autopilot.px4_versions import OLDEST, version_named
 from companion.wire.mavlink_frames import is_one_frame
 from sim.autopilot.commander import HOME_SET_NS, Commander, Result
 from sim.autopilot.commands import CommandRequest, answer, set_mode
@@ -65,7 +66,7 @@ class Autopilot:
         gust: GustParameters | None = None,
         noise: NoiseParameters | None = None,
         parameters: Mapping[str, float | int] | None = None,
-        px4_version: str = "1.16",
+        px4: str = OLDEST.name,
         yaw_rad: float = 0.0,
         seed: int = 0,
     ) -> None:
@@ -85,7 +86,8 @@ class Autopilot:
         self._ekf_origin_offset_m = ekf_origin_offset_m
         self._seed = f"{seed}/{system_id}"
         self._boots = 0
-        self.parameters = ParameterTable({**(parameters or {}), "MAV_SYS_ID": system_id}, px4_version)
+        self.version = version_named(px4)
+        self.parameters = ParameterTable({**(parameters or {}), "MAV_SYS_ID": system_id}, self.version)
         self._origin_ned_m = _plus(home_ned_m, ekf_origin_offset_m)
         start = _minus(NO_OFFSET, ekf_origin_offset_m)
         # The vehicle moves in the estimator's own frame; what is true in the fleet frame is that plus its origin.
@@ -362,6 +364,8 @@ class Autopilot:
         self._flight.take_setpoint(setpoint, self.now_ns)
 
     def _take_command(self, message: Any) -> None:
+        if message.target_system == 0 and not self.version.strict_commands:
+            return
         if isinstance(message, mavlink.MAVLink_command_int_message):
             latitude, longitude, altitude = message.x / 1e7, message.y / 1e7, message.z
         else:

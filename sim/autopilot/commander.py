@@ -78,6 +78,7 @@ class Commander:
         self._setpoint_silence_ns = self._spoolup_ns = self._landing_trigger_ns = 0
         self._ramp_s = self._speed_up_max_m_s = self._ramp_start_m_s = self._battery_critical = 0.0
         self.read_parameters()
+        self._blind_descent = Mode.DESCEND if parameters.version.descend_mode else Mode.LAND
         self.on_home_moved: Callable[[], None] = lambda: None
         """called when PX4 would set home anew: arming, lift-off, disarming"""
 
@@ -200,15 +201,16 @@ class Commander:
             self._killed_at_ns = now_ns
 
     def move_sticks(self, now_ns: int) -> None:
-        """A pilot moves the sticks: takes over automatic modes (COM_RC_OVERRIDE bit 0) and offboard (bit 1).
+        """A pilot moves the sticks fast: takes over automatic modes (COM_RC_OVERRIDE bit 0) and offboard (bit 1).
 
-        Since v1.18 both with MAN_OVERRIDE_SPD from 0 on.
+        Where MAN_OVERRIDE_SPD has taken its place: both, from 0 on.
         """
         self.pilot_present = True
-        if "MAN_OVERRIDE_SPD" in self._parameters:
-            override = 3 if self._parameters.number("MAN_OVERRIDE_SPD") >= 0.0 else 0
+        sticks = self._parameters.version.sticks
+        if sticks == "COM_RC_OVERRIDE":
+            override = self._parameters.integer(sticks)
         else:
-            override = self._parameters.integer("COM_RC_OVERRIDE")
+            override = 3 if self._parameters.number(sticks) >= 0.0 else 0
         if (self.mode.is_auto and override & 1) or (self.mode is Mode.OFFBOARD and override & 2):
             self.choose(Mode.POSCTL, now_ns)
 
@@ -235,21 +237,24 @@ class Commander:
         if self.user_mode is Mode.OFFBOARD and not self.may_fly(Mode.OFFBOARD, now_ns):
             self._lose_offboard()
         elif not self.position_valid and (self.user_mode.is_auto or self.user_mode is Mode.POSCTL):
-            # Without a position every such mode falls back to a blind descent, which PX4 shows as LAND.
-            self.mode, self.failsafe = Mode.LAND, True
+            # Without a position every such mode falls back to a blind descent.
+            self.mode, self.failsafe = self._blind_descent, True
         elif battery_mode is not None and self.user_mode not in (battery_mode, Mode.LAND, Mode.TERMINATION):
             self.mode, self.failsafe = battery_mode, True
         else:
             self.mode, self.failsafe = self.user_mode, False
 
     def _battery_action(self) -> Mode | None:
-        """Of a critical battery. COM_LOW_BAT_ACT: 0 warns, 2 lands, 3 returns, and lands in an emergency."""
+        """Of a critical battery. COM_LOW_BAT_ACT: 0 warns, 2 lands, 3 returns, and lands in an emergency; 4, where it
+        is one, returns, and stops the motors in an emergency."""
         action = self._parameters.integer("COM_LOW_BAT_ACT")
-        if action == 2:
-            return Mode.LAND
-        if action == 3:
-            return Mode.LAND if self.battery_fraction < self._parameters.number("BAT_EMERGEN_THR") else Mode.RTL
-        return None
+        if action not in self._parameters.version.battery_actions:
+            return None
+        if action in (3, 4):
+            if self.battery_fraction >= self._parameters.number("BAT_EMERGEN_THR"):
+                return Mode.RTL
+            return Mode.LAND if action == 3 else Mode.TERMINATION
+        return Mode.LAND if action == 2 else None
 
     def _lose_offboard(self) -> None:
         number = self._parameters.integer("COM_OBL_RC_ACT")
@@ -260,7 +265,7 @@ class Commander:
             return
         mode = MODE_OF_LOSS_ACTION[action]
         if mode.is_auto and not self.position_valid:
-            mode = Mode.LAND
+            mode = self._blind_descent
         self.mode, self.failsafe = mode, True
 
     def _step_takeoff(self, now_ns: int, wants_takeoff: bool) -> None:

@@ -1,4 +1,7 @@
-"""PX4's answers to MAVLink commands, as measured on PX4 1.16. Sans-I/O: one table, one function per command."""
+"""PX4's answers to MAVLink commands, as its versions were seen to give them (`tests/wire/answers.py`, held on PX4 too).
+
+Sans-I/O: one table, one function per command.
+"""
 
 import math
 import os
@@ -9,6 +12,7 @@ from typing import Protocol
 os.environ["MAVLINK20"] = "1"
 from pymavlink.dialects.v20 import development as mavlink
 
+from companion.vehicle.autopilot.px4_versions import Px4Version
 from sim.autopilot.commander import Commander, Result
 from sim.autopilot.modes import AUTO_MAIN_MODE, MAIN_MODES, MODE_OF_CUSTOM, Mode
 from sim.autopilot.navigator import Navigator
@@ -17,6 +21,8 @@ from sim.autopilot.telemetry import Telemetry
 FORCE_MAGIC = 21196.0
 """param2 of MAV_CMD_COMPONENT_ARM_DISARM that overrides the checks"""
 CUSTOM_MODE_FLAG = 1
+PROTOCOL_VERSION = 300
+"""a message that pymavlink does not have, and nobody reads: it is not sent"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +47,7 @@ class CommandTarget(Protocol):
     commander: Commander
     navigator: Navigator
     telemetry: Telemetry
+    version: Px4Version
 
     def send_now(self, message_id: int) -> bool:
         """Sends one message of a kind; False: not available."""
@@ -75,9 +82,10 @@ def _set_mode(target: CommandTarget, request: CommandRequest) -> Result:
 def set_mode(target: CommandTarget, base: int, main: int, sub: int) -> Result:
     """MAV_CMD_DO_SET_MODE and SET_MODE."""
     if not base & CUSTOM_MODE_FLAG or main not in MAIN_MODES:
-        return Result.ACCEPTED  # measured: accepted, and nothing changes
+        # Of versions that accept it nothing changes.
+        return Result.TEMPORARILY_REJECTED if target.version.strict_commands else Result.ACCEPTED
     mode = MODE_OF_CUSTOM.get(main << 16 | (sub if main == AUTO_MAIN_MODE else 0) << 24)
-    if mode is None:
+    if mode is None or mode is Mode.DESCEND:
         return Result.TEMPORARILY_REJECTED
     return target.change_mode(mode)
 
@@ -129,9 +137,16 @@ def _get_interval(target: CommandTarget, request: CommandRequest) -> Result:
     return Result.ACCEPTED
 
 
-def _request_capabilities(target: CommandTarget, _: CommandRequest) -> Result:
-    target.send_now(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
-    return Result.ACCEPTED
+def _send_at_request(message_id: int) -> Callable[[CommandTarget, CommandRequest], Result]:
+    """A command of its own for a message, which REQUEST_MESSAGE has taken the place of since."""
+
+    def send(target: CommandTarget, _: CommandRequest) -> Result:
+        if target.version.strict_commands:
+            return Result.UNSUPPORTED
+        target.send_now(message_id)
+        return Result.ACCEPTED
+
+    return send
 
 
 def _reboot(target: CommandTarget, request: CommandRequest) -> Result:
@@ -171,16 +186,32 @@ COMMANDS: dict[int, Callable[[CommandTarget, CommandRequest], Result]] = {
     mavlink.MAV_CMD_REQUEST_MESSAGE: _request_message,
     mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: _set_interval,
     mavlink.MAV_CMD_GET_MESSAGE_INTERVAL: _get_interval,
-    mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: _request_capabilities,
+    mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: _send_at_request(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION),
+    mavlink.MAV_CMD_REQUEST_PROTOCOL_VERSION: _send_at_request(PROTOCOL_VERSION),
+    mavlink.MAV_CMD_GET_HOME_POSITION: _send_at_request(mavlink.MAVLINK_MSG_ID_HOME_POSITION),
     mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: _reboot,
     mavlink.MAV_CMD_DO_FLIGHTTERMINATION: _terminate,
     mavlink.MAV_CMD_DO_CHANGE_SPEED: _accept,
     mavlink.MAV_CMD_MISSION_START: _start_mission,
 }
 """every other command is answered UNSUPPORTED"""
+USED_PARAMETERS: dict[int, frozenset[int]] = {
+    mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH: frozenset(),
+    mavlink.MAV_CMD_NAV_LAND: frozenset({1, 2, 4, 5, 6, 7}),
+    mavlink.MAV_CMD_NAV_TAKEOFF: frozenset({1, 4, 5, 6, 7}),
+    mavlink.MAV_CMD_DO_SET_MODE: frozenset({1, 2, 3}),
+    mavlink.MAV_CMD_DO_CHANGE_SPEED: frozenset({1, 2, 3}),
+    mavlink.MAV_CMD_COMPONENT_ARM_DISARM: frozenset({1, 2}),
+}
+"""command -> the parameters (param1 to param7) that it has; a value in another is DENIED by versions that look"""
 
 
 def answer(target: CommandTarget, request: CommandRequest) -> Result:
     """Carries out one command."""
+    used = USED_PARAMETERS.get(request.command)
+    if target.version.strict_commands and used is not None:
+        values = (*request.params, request.latitude_deg, request.longitude_deg, request.param7)
+        if any(value != 0.0 and not math.isnan(value) for k, value in enumerate(values, 1) if k not in used):
+            return Result.DENIED
     handler = COMMANDS.get(request.command)
     return Result.UNSUPPORTED if handler is None else handler(target, request)

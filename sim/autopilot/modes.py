@@ -17,6 +17,8 @@ class Mode(Enum):
     MISSION = (4, 4)
     RTL = (4, 5)
     LAND = (4, 6)
+    DESCEND = (4, 20)
+    """a landing without a position, of versions that have it as a mode of its own; nobody can choose it"""
     ACRO = (5, 0)
     OFFBOARD = (6, 0)
     STABILIZED = (7, 0)
@@ -30,12 +32,14 @@ class Mode(Enum):
         """needs a pilot's sticks"""
         self.is_auto = main == AUTO_MAIN_MODE
         """flown by the autopilot alone"""
+        self.is_landing = (main, sub) in ((4, 6), (4, 20))
+        """down to the ground and no farther"""
 
 
 MODE_OF_CUSTOM = {mode.custom_mode: mode for mode in Mode}
 MAIN_MODES = frozenset(mode.value[0] for mode in Mode)
 
-NOT_ARMABLE_MODES = frozenset({Mode.LAND, Mode.RTL, Mode.TERMINATION})
+NOT_ARMABLE_MODES = frozenset({Mode.LAND, Mode.DESCEND, Mode.RTL, Mode.TERMINATION})
 """modes that prevent arming (PX4's mode_req_prevent_arming); when disarmed PX4 falls back to the last choice that is
 none of these"""
 

@@ -10,7 +10,6 @@ from typing import Any
 os.environ["MAVLINK20"] = "1"
 from pymavlink.dialects.v20 import development as mavlink
 
-from sim.autopilot.modes import Mode
 from sim.autopilot.packing import Fields
 from sim.autopilot.setpoint import NAN
 from sim.autopilot.telemetry import Telemetry, to_body
@@ -227,7 +226,7 @@ def position_target_global_int(s: Telemetry) -> Any:
     east = s.east_m if math.isnan(setpoint.east_m) else setpoint.east_m
     latitude, longitude = s.degrees_e7(north, east)
     vehicle = s.vehicle
-    landing = s.commander.mode is Mode.LAND or math.isnan(setpoint.down_m)
+    landing = s.commander.mode.is_landing or math.isnan(setpoint.down_m)
     altitude = 0.0 if landing else s.projection.origin.altitude_amsl_m - setpoint.down_m
     return mavlink.MAVLink_position_target_global_int_message(
         s.now_ns // 1_000_000,

@@ -103,7 +103,7 @@ class Navigator:
         parameters = self._parameters
         if mode is Mode.TAKEOFF:
             return self._setpoint_takeoff(down_m, dt_s, lifted=lifted, may_climb=may_climb)
-        if mode is Mode.LAND:
+        if mode.is_landing:
             return self._setpoint_land(height_m, dt_s)
         if mode is Mode.RTL:
             return self._setpoint_return(down_m, height_m, dt_s)

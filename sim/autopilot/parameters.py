@@ -7,6 +7,7 @@ import math
 import struct
 from collections.abc import Mapping
 
+from companion.vehicle.autopilot.px4_versions import OLDEST, Px4Version
 from sim.autopilot.dynamics_parameters import LoopGains
 
 TYPE_INT32 = 6
@@ -41,7 +42,6 @@ DEFAULTS: dict[str, float | int] = {
     "COM_RCL_EXCEPT": 0,
     "COM_RC_IN_MODE": 3,
     "COM_RC_LOSS_T": 0.5,
-    "COM_RC_OVERRIDE": 1,
     "COM_SPOOLUP_TIME": 1.0,
     "EKF2_ACC_NOISE": 0.35,
     "EKF2_EN": 1,
@@ -91,20 +91,16 @@ DEFAULTS: dict[str, float | int] = {
     "SYS_HAS_GPS": 1,
     "SYS_HAS_MAG": 1,
 }
-"""name to default in v1.16; an int is INT32, a float is FLOAT"""
-CHANGES: dict[str, dict[str, float | int | None]] = {
-    "1.16": {},
-    "1.18": {"COM_RC_OVERRIDE": None, "MAN_OVERRIDE_SPD": 1.0},
-}
-"""version to what differs from v1.16; None: gone"""
+"""name to default in all versions; an int is INT32, a float is FLOAT"""
+OF_SOME: dict[str, float | int] = {"COM_RC_OVERRIDE": 1, "MAN_OVERRIDE_SPD": 1.0, "SDLOG_BACKEND": 3}
+"""those that a version may not have"""
 
 
-def defaults(version: str) -> dict[str, float | int]:
+def defaults(version: Px4Version) -> dict[str, float | int]:
     """The parameters of a version."""
-    if version not in CHANGES:
-        raise ValueError(f"PX4 version must be one of {', '.join(CHANGES)}, got {version!r}")
-    values = {**DEFAULTS, **CHANGES[version]}
-    return {name: value for name, value in values.items() if value is not None}
+    own = {name: OF_SOME[name] for name in (version.sticks, version.logging[0]) if name in OF_SOME}
+    gain = version.roll_pitch_gain_per_s
+    return {**DEFAULTS, **own, "MC_ROLL_P": gain, "MC_PITCH_P": gain}
 
 
 def _as_float32(value: float) -> float:
@@ -114,10 +110,9 @@ def _as_float32(value: float) -> float:
 class ParameterTable:
     """The parameters of one vehicle, sorted by name; indices are positions in that order."""
 
-    def __init__(self, overrides: Mapping[str, float | int], version: str = "1.16") -> None:
+    def __init__(self, overrides: Mapping[str, float | int], version: Px4Version = OLDEST) -> None:
+        self.version = version
         own = defaults(version)
-        self.says_errors = version != "1.16"
-        """whether a request for what there is not gets PARAM_ERROR: since v1.18"""
         self._values = {name: _as_float32(v) if isinstance(v, float) else v for name, v in own.items()}
         for name, value in overrides.items():
             if name not in self._values:
@@ -165,7 +160,7 @@ class ParameterTable:
         return value
 
     def set_from_wire(self, name: str, wire_value: float, wire_type: int) -> bool | None:
-        """Applies a PARAM_SET; True: changed, False: the value it already had, None: refused in silence."""
+        """Applies a PARAM_SET; True: changed, False: the value it already had, None: refused."""
         if name not in self._values or wire_type != self.wire_type(name):
             return None
         value: float | int

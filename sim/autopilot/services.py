@@ -11,6 +11,8 @@ from pymavlink.dialects.v20 import development as mavlink
 from sim.autopilot.link import Link
 from sim.autopilot.parameters import HASH_INDEX, HASH_NAME, TYPE_UINT32, ParameterTable
 
+TYPE_MISMATCH = 7
+"""MAV_PARAM_ERROR; newer than pymavlink's dialect"""
 FTP_NAK = 129
 """opcode of a refusal"""
 FTP_UNKNOWN_COMMAND = 7
@@ -51,28 +53,37 @@ class Services:
         self.listing = [HASH_INDEX, *range(len(self._parameters))]
 
     def read_parameter(self, message: Any) -> None:
-        """PARAM_REQUEST_READ, by index or by name; to what there is not PX4 answers since v1.18."""
+        """PARAM_REQUEST_READ, by index or by name."""
         table = self._parameters
         if message.param_index >= 0:
             if message.param_index < len(table):
                 self._send_parameter(message.param_index)
+            else:
+                self._refuse_parameter(message, "", message.param_index, mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST)
         elif message.param_id == HASH_NAME:
             self._send_parameter(HASH_INDEX)
         elif message.param_id in table:
             self._send_parameter(table.index(message.param_id))
-        elif table.says_errors:
+        else:
+            self._refuse_parameter(message, message.param_id, -1, mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST)
+
+    def _refuse_parameter(self, message: Any, name: str, index: int, error: int) -> None:
+        """PARAM_ERROR to who asked, of versions that say it; the others are silent."""
+        if self._parameters.version.parameter_errors:
             self._link.send(
                 mavlink.MAVLink_param_error_message(
-                    message.get_srcSystem(), message.get_srcComponent(), message.param_id.encode(), -1,
-                    mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST,
+                    message.get_srcSystem(), message.get_srcComponent(), name.encode(), index, error
                 )
-            )  # fmt: skip
+            )
 
     def set_parameter(self, message: Any) -> bool:
-        """PARAM_SET: a change is echoed twice, the same value once; False: refused in silence."""
+        """PARAM_SET: a change is echoed twice, the same value once; False: refused."""
         table = self._parameters
         changed = table.set_from_wire(message.param_id, message.param_value, message.param_type)
         if changed is None:
+            known = message.param_id in table
+            error = TYPE_MISMATCH if known else mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST
+            self._refuse_parameter(message, message.param_id, -1, error)
             return False
         for _ in range(2 if changed else 1):
             self._send_parameter(table.index(message.param_id))

@@ -18,8 +18,8 @@ SENSORS_HEALTHY = 0x0320C83F
 PREARM_CHECK = 1 << 28
 GPS_SENSOR = 1 << 5
 NO_VOLTAGE = 65535
-FLIGHT_SOFTWARE_VERSION = 1 << 24 | 16 << 16 | 0 << 8 | 255
-"""AUTOPILOT_VERSION.flight_sw_version: 1.16.0, release"""
+RELEASE = 255
+"""FIRMWARE_VERSION_TYPE"""
 CAPABILITIES = (
     mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
     | mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_INT
@@ -178,11 +178,13 @@ def gps_global_origin(s: Telemetry) -> Any:
 
 
 def autopilot_version(s: Telemetry) -> Any:
+    major, minor = s.parameters.version.number
+    software = major << 24 | minor << 16 | RELEASE
     return mavlink.MAVLink_autopilot_version_message(
         CAPABILITIES,
-        FLIGHT_SOFTWARE_VERSION,
+        software,
         0,
-        FLIGHT_SOFTWARE_VERSION,
+        software,
         1,
         [0] * 8,
         [0] * 8,

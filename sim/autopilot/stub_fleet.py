@@ -9,20 +9,10 @@ from companion.config.derived import Vehicle
 from companion.config.endpoints import autopilot_port, companion_port, udp_endpoint
 from companion.core.frames import Ned
 from companion.errors import ConfigError
+from companion.vehicle.autopilot.px4_versions import fleet_parameters, version_named
 from sim.autopilot.disturbances import GustParameters, NoiseParameters
 from sim.autopilot.dynamics_parameters import DynamicsParameters
-from sim.autopilot.parameters import defaults
 from sim.autopilot.stubs import StubFleetSettings, StubVehicleSettings
-
-LAND_ON_LOSS = 4
-FLEET_PARAMETERS: tuple[tuple[str, float | int], ...] = (
-    ("COM_OBL_RC_ACT", LAND_ON_LOSS),
-    ("COM_RC_OVERRIDE", 3),
-    ("MAN_OVERRIDE_SPD", 1.0),
-    ("NAV_RCL_ACT", 0),
-    ("COM_RCL_EXCEPT", 4),
-)
-"""PX4 parameters of a fleet without RC, where a version has them: land when the setpoints end; OFFBOARD needs no RC"""
 
 
 def _ports(vehicle: Vehicle) -> tuple[int, int]:
@@ -61,7 +51,7 @@ def stub_settings(
     """Settings of the stubs; each estimator's origin lies elsewhere, by up to `stub.origin_scatter_m`, after `seed`."""
     stub = config.stub
     random = Random(f"origins/{seed}")
-    known = defaults(stub.px4_version)
+    parameters = tuple(fleet_parameters(version_named(stub.px4)).items())
     vehicles = []
     for k, v in enumerate(config.vehicles):
         way, angle = stub.origin_scatter_m * random.random(), 2.0 * pi * random.random()
@@ -80,8 +70,8 @@ def stub_settings(
                 ),
                 yaw_rad=radians(config.formation.heading_deg),
                 booted_before_ns=round(k / len(config.vehicles) * 1e9 / config.limits.control_rate_hz),
-                parameters=tuple((name, value) for name, value in FLEET_PARAMETERS if name in known),
-                px4_version=stub.px4_version,
+                parameters=parameters,
+                px4=stub.px4,
             )
         )  # fmt: skip
     return StubFleetSettings(

@@ -24,6 +24,7 @@ import numpy as np
 
 from companion.core.frames import Geodetic, Ned
 from companion.errors import CompanionError
+from companion.vehicle.autopilot.px4_versions import OLDEST
 from sim.autopilot.autopilot import NO_OFFSET, Autopilot
 from sim.autopilot.disturbances import GustParameters, NoiseParameters
 from sim.autopilot.dynamics_parameters import DynamicsParameters
@@ -82,7 +83,7 @@ class StubVehicleSettings:
     """how much earlier than its host it booted: autopilots' streams are not in step with each other"""
     parameters: tuple[tuple[str, float | int], ...] = ()
     """PX4 parameters that differ from the default"""
-    px4_version: str = "1.16"
+    px4: str = OLDEST.name
     """whose parameters it has"""
 
 
@@ -229,7 +230,7 @@ def build_autopilot(
         gust=settings.gust,
         noise=settings.noise,
         parameters=dict(vehicle.parameters),
-        px4_version=vehicle.px4_version,
+        px4=vehicle.px4,
         yaw_rad=vehicle.yaw_rad,
         seed=settings.seed,
     )

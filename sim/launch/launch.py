@@ -59,6 +59,8 @@ class FlightOptions:
     """what the stubs suffer, and when after the take-off command"""
     allow_missing: bool = False
     """fly without the vehicles that do not come"""
+    logs: bool = False
+    """keep the SITL instances' flight logs"""
 
 
 def flight_folder(root: Path) -> Path:
@@ -160,7 +162,7 @@ class _Launch:
             more = [word for p in options.parameters for word in ("--parameter", p)]
             self.processes.spawn(
                 "autopilots", "sim", "sitl", "--fleet", file, "--px4", str(options.px4), "--truth", str(self._truth),
-                "--ready", str(self._ready), *more,
+                "--ready", str(self._ready), *more, *(["--logs"] if options.logs else []),
             )  # fmt: skip
         elif not options.external:
             self.processes.fork("autopilots", StubsJob(file, options.seed, str(self._truth), options.ground))
@@ -224,9 +226,15 @@ class _Launch:
             "missing": dict(missing),
             "exit_status": {i: self.processes.exit_status(f"companion-{i}") for i in watch.ids},
             "folder": str(options.folder),
+            "flight_logs": {i: _flight_logs(options.folder / f"px4-{i}") for i in watch.ids} if options.logs else {},
         }
         _write(options.folder / "summary.json", json.dumps(summary, indent=2) + "\n")
         return summary
+
+
+def _flight_logs(folder: Path) -> list[str]:
+    """Where a PX4 has written its logs (ULog), oldest first."""
+    return [str(path) for path in sorted(folder.rglob("*.ulg"))]
 
 
 def _without_none(tables: Any) -> Any:

@@ -1,7 +1,6 @@
 """A PX4 SITL on this machine: where its parts are, which parameters it has, and what a simulated fleet sets on it.
 
-PX4's versions differ in their parameters, and forks lie about their version: what holds is told by the names that the
-binary has.
+Forks lie about their version: of which row of `px4_versions` a build is is told by the parameters that its binary has.
 """
 
 import os
@@ -10,6 +9,7 @@ from functools import cache
 from pathlib import Path
 
 from companion.errors import CompanionError
+from companion.vehicle.autopilot.px4_versions import NEWEST, VERSIONS, Px4Version, fleet_parameters
 
 PLACES = (
     "/opt/px4", "build/px4_sitl_default", "PX4-Autopilot/build/px4_sitl_default",
@@ -20,26 +20,8 @@ HOW_TO_GET = (
     "Get PX4-Autopilot v1.16 or later from its project and run `make px4_sitl_default` "
     "(https://docs.px4.io/main/en/dev_setup/building_px4.html), or install PX4's own package, which lies in /opt/px4"
 )
-FLEET_PARAMETERS: Mapping[str, float | int] = {
-    "COM_OBL_RC_ACT": 4,
-    "COM_RC_OVERRIDE": 3,
-    "MAN_OVERRIDE_SPD": 1.0,
-    "COM_RC_IN_MODE": 4,
-    "NAV_RCL_ACT": 0,
-    "NAV_DLL_ACT": 0,
-    "COM_RCL_EXCEPT": 4,
-    "SDLOG_MODE": -1,
-}
-"""a fleet without RC: land when the setpoints end; no stick input; no log on disk. Of `px4_versions.RENAMED` a
-version has one"""
-NOISY_SENSORS: Mapping[str, float | int] = {"EKF2_ACC_NOISE": 0.6, "EKF2_GYR_NOISE": 0.1}
-"""what SIH's sensors are like until v1.17: in flight their white noise is 0.5, 1.7 and 1.4 m/s^2 and 0.14, 0.07 and
-0.03 rad/s a sample, of which the estimator's defaults (0.35 and 0.015) know nothing, so that it wanders by half a metre
-(see docs/px4.md). Since v1.18 they are quiet, and these values make the estimate worse"""
-SINCE_1_18 = "MAN_OVERRIDE_SPD"
-"""a parameter that tells the two apart"""
-LOG_BACKEND = "SDLOG_BACKEND"
-"""where it is, SDLOG_MODE -1 stops no log: 25 MB a minute and vehicle"""
+SITL_PARAMETERS: Mapping[str, float | int] = {"COM_RC_IN_MODE": 4, "NAV_DLL_ACT": 0}
+"""of a simulated fleet, beside what every fleet sets: no stick input, no ground station"""
 
 
 def find_build(given: Path | None) -> Path:
@@ -71,9 +53,16 @@ def has_parameter(build: Path, name: str) -> bool:
     return b"\0" + name.encode() + b"\0" in (build / "bin" / "px4").read_bytes()
 
 
-def simulator_parameters(build: Path) -> dict[str, float | int]:
-    """What is set beside FLEET_PARAMETERS on a build's instances, by what that build is."""
-    parameters: dict[str, float | int] = {} if has_parameter(build, SINCE_1_18) else dict(NOISY_SENSORS)
-    if has_parameter(build, LOG_BACKEND):
-        parameters[LOG_BACKEND] = 0
-    return parameters
+def build_version(build: Path) -> Px4Version:
+    """The newest row of PX4's versions whose parameters a build has; of none: the newest of all."""
+    rows = [v for v in VERSIONS if has_parameter(build, v.sticks) and has_parameter(build, v.logging[0])]
+    return rows[-1] if rows else NEWEST
+
+
+def sitl_parameters(build: Path, *, logs: bool = False) -> dict[str, float | int]:
+    """What is set on a build's instances; `logs`: they write their logs (25 MB a minute and vehicle)."""
+    version = build_version(build)
+    name, value = version.logging
+    return {
+        **fleet_parameters(version), **SITL_PARAMETERS, **version.sih_parameters, **({} if logs else {name: value}),
+    }  # fmt: skip

@@ -26,12 +26,11 @@ from companion.config.derived import Vehicle
 from companion.core.frames import Geodetic, Ned, geodetic_to_ned, ned_to_geodetic
 from companion.errors import CompanionError
 from companion.io.link import SO_TIMESTAMPNS, received_unix_ns
-from companion.vehicle.autopilot.px4_versions import same_setting
 from companion.wire.mavlink_frames import HEAD_2
 from companion.wire.px4 import interval_parameters, parameter_value
 from sim.autopilot.stubs import TRUTH_DTYPE
 from sim.launch.ended import tell_ended
-from sim.launch.px4_build import FLEET_PARAMETERS, simulator_parameters
+from sim.launch.px4_build import sitl_parameters
 from sim.launch.px4_instance import STATE_PORT, Px4Instance
 
 TRUTH_PORT = 19410
@@ -60,6 +59,8 @@ class SitlSettings:
     stop_fd: int
     parameters: Mapping[str, float | int]
     """beyond what `px4_build` has for a fleet on this build, or instead of one of them"""
+    logs: bool = False
+    """whether the instances write their logs (ULog)"""
     ready_path: Path | None = None
     """a file that is made once every parameter was read back as set"""
     log: Callable[[str], None] = print
@@ -78,7 +79,7 @@ class _Instance:
             )
         self.truth_socket = _bind(TRUTH_PORT + self.index, f"vehicle {vehicle.id}'s truth")
         home = ned_to_geodetic(Ned(vehicle.pad_north_m, vehicle.pad_east_m, 0.0), config.origin)
-        self.parameters = {**FLEET_PARAMETERS, **simulator_parameters(settings.build), **settings.parameters}
+        self.parameters = {**sitl_parameters(settings.build, logs=settings.logs), **settings.parameters}
         try:
             self.px4 = Px4Instance(
                 self.index, home, settings.build, settings.folder / f"px4-{vehicle.id}", self.parameters
@@ -90,8 +91,6 @@ class _Instance:
         self.custom_mode = 0
         self.landed_state = 1
         self.checked: dict[str, float | int] = {}
-        self.demanded = frozenset(settings.parameters)
-        """what the user has set: to be read back under that very name"""
         self.clock: list[tuple[float, float]] = []
         """(UTC s, the simulation's s), first and latest"""
         self.mode_streamed = False
@@ -292,15 +291,5 @@ def _missing(instance: _Instance) -> dict[str, float | int | None]:
     return {
         name: instance.checked.get(name)
         for name, value in instance.parameters.items()
-        if not _as_set(instance, name, value) and (name in instance.demanded or not _other_name_set(instance, name))
+        if name not in instance.checked or not abs(instance.checked[name] - value) <= 1e-6
     }
-
-
-def _as_set(instance: _Instance, name: str, value: float | int) -> bool:
-    return name in instance.checked and abs(instance.checked[name] - value) <= 1e-6
-
-
-def _other_name_set(instance: _Instance, name: str) -> bool:
-    """Whether another version's name of the same setting was read back as set."""
-    others = (n for n in same_setting(name) if n != name and n in instance.parameters)
-    return name not in instance.checked and any(_as_set(instance, n, instance.parameters[n]) for n in others)

@@ -51,7 +51,7 @@ def test_a_vehicle_whose_autopilot_has_an_unfit_parameter_refuses_whoever_asks(
 
 
 def of_1_18(tables: dict[str, Any]) -> None:
-    tables["stub"]["px4_version"] = "1.18"
+    tables["stub"]["px4"] = "1.18"
 
 
 def test_a_vehicle_on_px4_1_18_takes_off_and_its_sticks_must_end_offboard() -> None:
@@ -60,7 +60,8 @@ def test_a_vehicle_on_px4_1_18_takes_off_and_its_sticks_must_end_offboard() -> N
     assert ls.vehicles[1].agent.operator.unready(ls.now) == []
     set_parameter(ls, 1, "MAN_OVERRIDE_SPD", -1.0)
     ls.run_until(13.0)
-    assert take_off(ls, 1) == "MAN_OVERRIDE_SPD is -1, must be >= 0: a pilot's sticks would not end OFFBOARD"
+    refusal = "MAN_OVERRIDE_SPD is -1, must be >= 0 (sticks moved that fast): a pilot's sticks would not end OFFBOARD"
+    assert take_off(ls, 1) == refusal
     set_parameter(ls, 1, "MAN_OVERRIDE_SPD", 1.0)
     ls.run_until(20.0)
     assert take_off(ls, 1) is None

@@ -8,16 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 import tomli_w
-from fake_px4 import VERSION, fake_build
+from fake_px4 import fake_build
 from fleet_process import flight_folder, run
 
 from companion.io.recording import read_recording
+from companion.vehicle.autopilot.px4_versions import OLDEST, VERSIONS
 from sim.autopilot.stubs import TRUTH_DTYPE
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(400)]
 
 
-def fly(folder: Path, *more: str) -> Any:
+def fly(folder: Path, *more: str, version: str = OLDEST.name) -> Any:
     """`fleet up` on one stand-in for PX4, on PX4's own ports."""
     tables = {
         "fleet": {"name": f"launched-{os.getpid()}-{folder.name[-1]}", "origin": {
@@ -29,7 +30,7 @@ def fly(folder: Path, *more: str) -> Any:
     }  # fmt: skip
     file = folder / "fleet.toml"
     file.write_text(tomli_w.dumps(tables))
-    build = fake_build(folder / "build")
+    build = fake_build(folder / "build", version)
     return run(
         "sim", "up", "--fleet", str(file), "--out", str(folder / "flights"), "--autopilot", "px4", "--px4", str(build),
         "--json", *more, folder=folder,
@@ -56,11 +57,10 @@ def test_a_parameter_that_px4_does_not_have_ends_the_start_on_the_ground(tmp_pat
     assert not armed(tmp_path)
 
 
-@pytest.mark.parametrize("version", ["1.16", "1.18"])
+@pytest.mark.parametrize("version", [v.name for v in VERSIONS])
 def test_whichever_name_of_a_setting_this_px4_has_is_read_back_and_then_it_takes_off(
-    tmp_path: Path, version: str, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, version: str
 ) -> None:
-    monkeypatch.setenv(VERSION, version)
-    done = fly(tmp_path, "--for", "6", "--parameter", "COM_OF_LOSS_T=0.9")
+    done = fly(tmp_path, "--for", "6", "--parameter", "COM_OF_LOSS_T=0.9", version=version)
     assert commands(tmp_path)[0] == "takeoff", done.stderr
     assert armed(tmp_path)

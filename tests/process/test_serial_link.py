@@ -18,11 +18,10 @@ from stub_process import QUICK
 from companion.core.frames import Ned
 from companion.errors import CompanionError
 from companion.io.link import SERIAL_UNSENT_MOST, SerialLink
+from companion.vehicle.autopilot.px4_versions import OLDEST, fleet_parameters
 from companion.wire.mavlink_frames import FrameSplitter
 from sim.autopilot.autopilot import Autopilot
 from sim.autopilot.disturbances import GustParameters, NoiseParameters
-from sim.autopilot.parameters import defaults
-from sim.autopilot.stub_fleet import FLEET_PARAMETERS
 
 pytestmark = pytest.mark.process
 BAUD = 921600
@@ -172,7 +171,7 @@ def test_a_vehicle_flies_over_a_serial_line(tmp_path: Path) -> None:
             system_id=1, boot_ns=now_ns, utc_offset_ns=time.time_ns() - now_ns, fleet_origin=fleet.config.origin,
             home_ned_m=Ned(0.0, 0.0, 0.0), gust=GustParameters(sigma_m_s2=0.0),
             noise=NoiseParameters(position_sigma_m=0.0, velocity_sigma_m_s=0.0),
-            parameters={k: v for k, v in FLEET_PARAMETERS + QUICK if k in defaults("1.16")},
+            parameters={**fleet_parameters(OLDEST), **dict(QUICK)},
         )  # fmt: skip
         over = threading.Event()
         thread = threading.Thread(target=serve, args=(autopilot, ours, over))

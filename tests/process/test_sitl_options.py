@@ -7,7 +7,9 @@ from fleet_process import run
 
 from companion.core.frames import Geodetic
 from companion.errors import CompanionError, ConfigError
-from sim.launch.px4_build import NOISY_SENSORS, find_build, simulator_parameters
+from companion.vehicle.autopilot.px4_versions import NEWEST, VERSIONS, Px4Version
+from sim.autopilot.parameters import defaults
+from sim.launch.px4_build import build_version, find_build, sitl_parameters
 from sim.launch.px4_instance import Px4Instance, parse_parameters
 
 pytestmark = pytest.mark.process
@@ -71,11 +73,21 @@ def test_a_px4_is_found_where_it_is_named_and_where_it_usually_lies(
         find_build(None)
 
 
-def test_what_is_set_on_a_build_follows_from_the_parameters_that_it_has(tmp_path: Path) -> None:
-    old = a_build(tmp_path / "1.16", "COM_RC_OVERRIDE", "SDLOG_MODE")
-    new = a_build(tmp_path / "1.18", "MAN_OVERRIDE_SPD", "SDLOG_BACKEND", "SDLOG_MODE")
-    assert simulator_parameters(old) == NOISY_SENSORS
-    assert simulator_parameters(new) == {"SDLOG_BACKEND": 0}
+@pytest.mark.parametrize("version", VERSIONS, ids=lambda v: v.name)
+def test_of_which_version_a_build_is_follows_from_the_parameters_that_it_has(
+    tmp_path: Path, version: Px4Version
+) -> None:
+    build = a_build(tmp_path / "build", *defaults(version))
+    row = build_version(build)
+    assert (row.sticks, row.logging) == (version.sticks, version.logging)
+    assert sitl_parameters(build).keys() <= {*defaults(version), *version.sih_parameters}
+    assert sitl_parameters(build)[version.logging[0]] == version.logging[1]
+    assert version.logging[0] not in sitl_parameters(build, logs=True)
+    assert ("EKF2_GYR_NOISE" in sitl_parameters(build)) == (version.name in ("1.16", "1.17")), "SIH's noisy sensors"
+
+
+def test_of_a_build_that_tells_nothing_the_newest_is_taken(tmp_path: Path) -> None:
+    assert build_version(a_build(tmp_path / "build")) is NEWEST
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import development as dialect
 from companion.config import FleetConfig, load
 from companion.core.values import Phase
 from companion.wire.px4 import FORCE
-from sim.launch.px4_build import FLEET_PARAMETERS
+from sim.launch.px4_build import sitl_parameters
 from sim.launch.px4_instance import Px4Instance
 
 DELAYS_S = (0.1, 0.3, 0.6, 0.9, 1.2, 1.6, 2.0)
@@ -66,7 +66,7 @@ def test_a_vehicle_that_its_pilot_disarms_just_after_arming_stays_disarmed(
 ) -> None:
     config = one_vehicle()
     vehicle = AgentOnLink(config, COMPANION_PORT, AUTOPILOT_PORT)
-    instance = Px4Instance(0, config.origin, build, tmp_path / "px4", FLEET_PARAMETERS)
+    instance = Px4Instance(0, config.origin, build, tmp_path / "px4", sitl_parameters(build))
     try:
         check_one_disarm(vehicle, delay_s)
     finally:

@@ -12,7 +12,7 @@ from companion.config import FleetConfig, load
 from companion.core.frames import Geodetic, Ned, ned_to_geodetic
 from companion.vehicle.autopilot.port import AutopilotFacts, Estimate
 from companion.vehicle.autopilot.px4_parameters import PARAMETERS, identity_checks, parameter_checks, parameter_rules
-from companion.vehicle.autopilot.px4_versions import RENAMED, same_setting
+from companion.vehicle.autopilot.px4_versions import NEWEST, OLDEST, VERSIONS, Px4Version
 from companion.vehicle.preflight import own_checks
 from companion.wire.operator import Check, PreflightReport, decode, encode, unmet
 
@@ -187,7 +187,7 @@ PARAMETER_LIMITS: list[tuple[str, list[float], list[float]]] = [
     ("COM_OBL_RC_ACT", [4], [-1, 0, 1, 2, 3, 6, 7]),
     ("COM_RC_OVERRIDE", [2, 3], [0, 1]),
     ("MAN_OVERRIDE_SPD", [0.0, 1.0, 10.0], [-1.0, -0.001]),
-    ("NAV_RCL_ACT", [0, 1, 2, 3], [-1, 4, 5, 6]),
+    ("NAV_RCL_ACT", [0, 1, 2, 3, 7], [-1, 4, 5, 6]),
     ("COM_RCL_EXCEPT", [4, 5, 6, 7], [0, 1, 2, 3]),
     ("NAV_DLL_ACT", [0, 1, 2, 3], [-1, 4, 5, 6]),
     ("GF_ACTION", [0, 1, 2, 3, 5], [-1, 4, 6]),
@@ -233,7 +233,7 @@ def test_with_a_pilot_position_mode_is_fit_and_lost_rc_must_be_acted_on() -> Non
     assert faults(there, pilots) == []
     assert faults(replace(there, sensors_health=0), pilots) == ["no RC receiver"]
     (said,) = faults(replace(there, parameters={**there.parameters, "NAV_RCL_ACT": 0}), pilots)
-    assert said.startswith("NAV_RCL_ACT is 0, must be 1, 2 or 3")
+    assert said.startswith("NAV_RCL_ACT is 0, must be 1, 2, 3 or 7: lost RC must not end in a fall, nor in nothing")
 
 
 def test_limits_that_float32_cannot_hold_are_met_by_their_nearest() -> None:
@@ -244,7 +244,25 @@ def test_limits_that_float32_cannot_hold_are_met_by_their_nearest() -> None:
 def test_parameters_that_are_still_read_and_those_that_never_come_are_told_apart() -> None:
     some = {name: v for name, v in FIT_PARAMETERS.items() if name not in ("GF_ACTION", "NAV_DLL_ACT")}
     told = faults(replace(FIT, parameters=some, missing=frozenset({"GF_ACTION"})))
-    assert told == ["GF_ACTION cannot be read", "1 of 12 parameters not read yet"]
+    unread = "GF_ACTION cannot be read: a crossed fence must not end in a fall"
+    assert told == [unread, "1 of 12 parameters not read yet"]
+
+
+@pytest.mark.parametrize("version", VERSIONS, ids=lambda v: v.name)
+def test_actions_are_judged_by_the_version_at_hand_and_the_reason_is_true_of_it(version: Px4Version) -> None:
+    def said(name: str, value: int) -> str:
+        values = {**FIT_PARAMETERS, name: value}
+        rows = {c.name: c for c in parameter_checks(values, frozenset(), CONFIG, version)}
+        return "" if rows[name].passed else rows[name].message
+
+    assert (said("NAV_RCL_ACT", 7) == "") == (version.number >= (1, 18))
+    assert said("NAV_RCL_ACT", 5) != ""
+    emergency = "COM_LOW_BAT_ACT is 4, must be 0, 2 or 3: "
+    if version is NEWEST:
+        assert said("COM_LOW_BAT_ACT", 4) == emergency + "4 stops the motors in an emergency"
+    else:
+        assert said("COM_LOW_BAT_ACT", 4) == emergency + "not an action of this PX4's"
+    assert OLDEST.battery_actions < NEWEST.battery_actions
 
 
 def test_of_an_autopilot_that_is_no_px4_no_parameter_is_wanted() -> None:
@@ -288,20 +306,15 @@ def test_the_assignments_hash_follows_slots_and_vehicles() -> None:
     assert wider.assignment_hash != CONFIG.assignment_hash
 
 
-def test_every_name_of_a_renamed_setting_is_read_and_judged() -> None:
-    for renamed in RENAMED:
-        assert {renamed.before, renamed.after} <= set(PARAMETERS)
-        assert same_setting(renamed.before) == same_setting(renamed.after) == (renamed.before, renamed.after)
-    assert same_setting("GF_ACTION") == ("GF_ACTION",)
-
-
 def test_the_name_under_which_this_px4_has_a_setting_is_enough_and_one_is_needed() -> None:
     without = {name: v for name, v in FIT_PARAMETERS.items() if name != "COM_RC_OVERRIDE"}
     assert faults(replace(FIT, parameters={**without, "MAN_OVERRIDE_SPD": 1.0})) == []
     assert faults(replace(FIT, parameters={**without, "MAN_OVERRIDE_SPD": -1.0})) == [
-        "MAN_OVERRIDE_SPD is -1, must be >= 0: a pilot's sticks would not end OFFBOARD"
+        "MAN_OVERRIDE_SPD is -1, must be >= 0 (sticks moved that fast): a pilot's sticks would not end OFFBOARD"
     ]
     one_missing = replace(FIT, parameters=without, missing=frozenset({"COM_RC_OVERRIDE"}))
     assert faults(one_missing) == ["1 of 12 parameters not read yet"]
     both = frozenset({"COM_RC_OVERRIDE", "MAN_OVERRIDE_SPD"})
-    assert faults(replace(one_missing, missing=both)) == ["COM_RC_OVERRIDE or MAN_OVERRIDE_SPD cannot be read"]
+    assert faults(replace(one_missing, missing=both)) == [
+        "COM_RC_OVERRIDE or MAN_OVERRIDE_SPD cannot be read: a pilot's sticks would not end OFFBOARD"
+    ]

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import development as dialect
 
 from companion.config import load
-from companion.core.events import RequestRefused, RequestUnanswered
+from companion.core.events import AutopilotIdentified, RequestRefused, RequestUnanswered
 from companion.core.frames import Geodetic, Ned, ned_to_geodetic
 from companion.core.values import Instant
 from companion.vehicle.autopilot.boot_clock import LATENCY_WINDOW_NS, BootClock
@@ -24,6 +24,7 @@ from companion.vehicle.autopilot.port import LAND, OFFBOARD, FlightMode, Verb
 from companion.vehicle.autopilot.px4 import Px4Autopilot
 from companion.vehicle.autopilot.px4_parameters import PARAMETERS
 from companion.vehicle.autopilot.requests import RETRY_S, TRIES
+from companion.wire import px4 as px4_wire
 from companion.wire.px4 import Px4Mode, arm_parameters, streams_hz, takeoff_parameters
 
 SYSTEM_ID = 7
@@ -65,6 +66,11 @@ class Px4:
             seconds,
         )  # fmt: skip
 
+    def version(self, seconds: float, number: int = 0x011000FF) -> None:
+        zeros = [0] * 8
+        message = dialect.MAVLink_autopilot_version_message(0, number, 0, 0, 0, zeros, zeros, zeros, 0, 0, 0)
+        self.says(message, seconds)
+
     def answer(self, command: int, result: int, seconds: float) -> None:
         self.says(dialect.MAVLink_command_ack_message(command, result, 0, 0, SYSTEM_ID, 191), seconds)
 
@@ -104,6 +110,8 @@ def ready(at_s: float = 10.0) -> Px4:
     one.origin(at_s)
     one.position(at_s)
     one.says(dialect.MAVLink_estimator_status_message(0, ESTIMATOR_OK, 0, 0, 0, 0, 0, 0, 0.5, 0.5), at_s)
+    one.version(at_s)
+    one.client.events.clear()
     return one
 
 
@@ -386,7 +394,27 @@ def test_in_a_local_frame_the_autopilots_frame_is_the_fleets() -> None:
     assert one.position(2.0, 1.0, 2.0, -3.0, 0.0, 0.0, 0.0)
     assert one.client.position_ned_m == (1.0, 2.0, -3.0)
     one.run(0.0, 3.0)
-    assert one.times_of(512) == []
+    assert one.times_of(512, px4_wire.ORIGIN_MESSAGE_ID) == []
+
+
+def test_it_is_asked_for_its_version_on_the_ground_alone_and_anew_after_a_boot() -> None:
+    one = px4()
+    one.heartbeat(0.0)
+    one.run(0.0, 2.5)
+    assert len(one.times_of(512, px4_wire.VERSION_MESSAGE_ID)) == 3
+    one.heartbeat(2.5, armed=True)
+    one.run(2.5, 6.0)
+    assert len(one.times_of(512, px4_wire.VERSION_MESSAGE_ID)) == 3
+    one.heartbeat(6.0)
+    one.version(6.0, 1 << 24 | 18 << 16 | 255)
+    one.version(6.1, 1 << 24 | 18 << 16 | 255)
+    assert [e for e in one.client.events if isinstance(e, AutopilotIdentified)] == [AutopilotIdentified("PX4 1.18.0")]
+    one.run(6.1, 10.0)
+    assert len(one.times_of(512, px4_wire.VERSION_MESSAGE_ID)) == 3
+    one.position(10.0, boot_ms=9000)
+    one.position(10.1, boot_ms=100)
+    one.run(10.1, 10.6)
+    assert len(one.times_of(512, px4_wire.VERSION_MESSAGE_ID)) == 4
 
 
 # -- facts -------------------------------------------------------------------------------------------------------------

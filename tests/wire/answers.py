@@ -1,4 +1,4 @@
-"""What PX4 answers to commands, as one table for the stand-in (1.16) and for the real one, be it 1.16 or newer."""
+"""What PX4 answers to commands, as one table for the stand-in and for the real one, of every version."""
 
 import math
 from collections.abc import Callable
@@ -7,6 +7,7 @@ from typing import Any, Protocol
 
 from autopilot_flight import mavlink
 
+from companion.vehicle.autopilot.px4_versions import OLDEST, Px4Version
 from sim.autopilot.modes import Mode
 
 ACCEPTED, REJECTED, DENIED, UNSUPPORTED, FAILED = 0, 1, 2, 3, 4
@@ -64,8 +65,10 @@ class Answer:
     armed: bool | None = None
     """afterwards; None: as before"""
     target: tuple[int, int] = (1, 1)
-    result_since_1_18: int | None = None
-    """where newer PX4 answers otherwise"""
+    strict: int | None = None
+    """where versions with `strict_commands` answer otherwise"""
+    strict_armed: bool | None = None
+    """likewise"""
 
 
 def _mode(mode: Mode) -> tuple[float, ...]:
@@ -100,6 +103,18 @@ ON_THE_GROUND = (
     Answer("landed", "arm, to another system", ARM, (1,), NOBODY, target=(2, 1)),
     Answer("landed", "arm, to another component", ARM, (1,), NOBODY, target=(1, 2)),
     Answer("landed", "arm, to any component", ARM, (1,), ACCEPTED, armed=True, target=(1, 0)),
+    Answer("landed", "an unknown main mode", SET_MODE, (1, 77, 0), ACCEPTED, strict=REJECTED),
+    Answer("landed", "a mode without the custom flag", SET_MODE, (0, 6, 0), ACCEPTED, strict=REJECTED),
+    Answer("landed", "arm with a third parameter", ARM, (1, 0, 1), ACCEPTED, armed=True, strict=DENIED,
+           strict_armed=False),
+    Answer("landed", "a mode with a fourth parameter", SET_MODE, (*_mode(Mode.LOITER), 1), ACCEPTED, strict=DENIED),
+    Answer("landed", "return with a parameter", mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH, (1,), ACCEPTED, Mode.RTL,
+           strict=DENIED),
+    *(Answer("landed", f"{name} by a command of its own", command, (1,), ACCEPTED, strict=UNSUPPORTED)
+      for name, command in (("HOME_POSITION", mavlink.MAV_CMD_GET_HOME_POSITION),
+                            ("PROTOCOL_VERSION", mavlink.MAV_CMD_REQUEST_PROTOCOL_VERSION),
+                            ("AUTOPILOT_VERSION", mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES))),
+    Answer("landed", "arm, to any system", ARM, (1,), NOBODY, target=(0, 1), strict=ACCEPTED, strict_armed=True),
     Answer("armed", "disarm", ARM, (0,), ACCEPTED, armed=False),
 )  # fmt: skip
 IN_THE_AIR = (
@@ -107,9 +122,9 @@ IN_THE_AIR = (
     *(Answer("flying", f"{m.name} without a pilot", SET_MODE, _mode(m), REJECTED) for m in MANUAL_MODES),
     Answer("flying", "MISSION without a mission", SET_MODE, _mode(Mode.MISSION), REJECTED),
     Answer("flying", "an unknown AUTO sub-mode", SET_MODE, (1, 4, 99), REJECTED),
-    Answer("flying", "an unknown main mode", SET_MODE, (1, 77, 0), ACCEPTED, result_since_1_18=REJECTED),
+    Answer("flying", "an unknown main mode", SET_MODE, (1, 77, 0), ACCEPTED, strict=REJECTED),
     Answer("flying", "a mode without the custom flag", SET_MODE, (0, 6, 0), ACCEPTED,
-           result_since_1_18=REJECTED),
+           strict=REJECTED),
     Answer("flying", "OFFBOARD without a stream", SET_MODE, _mode(Mode.OFFBOARD), REJECTED),
     Answer("offboard", "reposition", mavlink.MAV_CMD_DO_REPOSITION, (-1, 1, 0, NAN, NAN, NAN, NAN), ACCEPTED,
            Mode.LOITER),
@@ -138,18 +153,20 @@ def prepare(flyer: Flyer, when: str) -> None:
     flyer.run(0.3)
 
 
-def mismatches(flyer: Flyer, row: Answer, version: tuple[int, int] = (1, 16)) -> list[str]:
+def mismatches(flyer: Flyer, row: Answer, version: Px4Version = OLDEST) -> list[str]:
     """What is otherwise than the table says of that version."""
     prepare(flyer, row.when)
     before = (flyer.mode, flyer.armed)
     result = flyer.command(row.command, *row.params, target=row.target)
-    expected = (before[0] if row.mode is None else row.mode, before[1] if row.armed is None else row.armed)
+    strict = version.strict_commands and row.strict is not None
+    armed = row.strict_armed if strict else row.armed
+    mode = None if strict else row.mode
+    expected = (before[0] if mode is None else mode, before[1] if armed is None else armed)
     flyer.run(HEARTBEAT_S)
     found = (flyer.mode, flyer.armed)
     where = f"{row.when}: {row.what}"
     wrong = []
-    newer = version >= (1, 18) and row.result_since_1_18 is not None
-    promised = row.result_since_1_18 if newer else row.result
+    promised = row.strict if strict else row.result
     if result != promised:
         wrong.append(f"{where}: result {result}, expected {promised}")
     if found != expected:

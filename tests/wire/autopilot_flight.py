@@ -9,6 +9,7 @@ os.environ["MAVLINK20"] = "1"
 from pymavlink.dialects.v20 import development as mavlink
 
 from companion.core.frames import Geodetic, Ned
+from companion.vehicle.autopilot.px4_versions import OLDEST
 from sim.autopilot.autopilot import Autopilot
 from sim.autopilot.disturbances import GustParameters, NoiseParameters
 from sim.autopilot.dynamics_parameters import DynamicsParameters
@@ -50,7 +51,7 @@ class Flight:
         boot_s: float = 0.0,
         seed: int = 1,
         quiet: bool = True,
-        px4_version: str = "1.16",
+        px4: str = OLDEST.name,
     ) -> None:
         self.boot_s = boot_s
         self.now_ns = round(boot_s * SECOND_NS)
@@ -65,7 +66,7 @@ class Flight:
             gust=gust,
             noise=noise,
             parameters=parameters,
-            px4_version=px4_version,
+            px4=px4,
             seed=seed,
         )
         self.received: list[tuple[float, Any]] = []

@@ -165,7 +165,7 @@ def test_sticks_take_over_from_offboard_only_with_bit_1_of_com_rc_override(overr
 
 @pytest.mark.parametrize(("speed", "mode"), [(-1.0, Mode.OFFBOARD), (0.0, Mode.POSCTL), (1.0, Mode.POSCTL)])
 def test_since_1_18_sticks_take_over_unless_man_override_spd_is_negative(speed: float, mode: Mode) -> None:
-    flight = Flight(parameters={"MAN_OVERRIDE_SPD": speed}, px4_version="1.18")
+    flight = Flight(parameters={"MAN_OVERRIDE_SPD": speed}, px4="1.18")
     assert "COM_RC_OVERRIDE" not in flight.autopilot.parameters
     flight.take_off()
     flight.go_offboard()

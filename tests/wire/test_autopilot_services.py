@@ -8,11 +8,15 @@ from autopilot_flight import Flight, mavlink
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from companion.vehicle.autopilot.px4_versions import OLDEST
 from sim.autopilot.autopilot import STEP_NS
 from sim.autopilot.modes import Mode
-from sim.autopilot.parameters import DEFAULTS, ParameterTable
+from sim.autopilot.parameters import ParameterTable, defaults
 
 INT32, REAL32 = mavlink.MAV_PARAM_TYPE_INT32, mavlink.MAV_PARAM_TYPE_REAL32
+
+
+NAMES = sorted(defaults(OLDEST))
 
 
 @pytest.fixture
@@ -52,9 +56,9 @@ def test_list_begins_with_the_hash_and_has_every_parameter_once_in_order(flight:
     flight.run(2.0)
     values = flight.of("PARAM_VALUE")
     assert (values[0].param_id, values[0].param_index, values[0].param_type) == ("_HASH_CHECK", 65535, 5)
-    assert [message.param_id for message in values[1:]] == sorted(DEFAULTS)
-    assert [message.param_index for message in values[1:]] == list(range(len(DEFAULTS)))
-    assert {message.param_count for message in values} == {len(DEFAULTS)}
+    assert [message.param_id for message in values[1:]] == NAMES
+    assert [message.param_index for message in values[1:]] == list(range(len(NAMES)))
+    assert {message.param_count for message in values} == {len(NAMES)}
 
 
 def test_int32_is_carried_bytewise_and_float_as_it_is(flight: Flight) -> None:
@@ -70,7 +74,7 @@ def test_negative_int32_survives_the_float_that_carries_it(flight: Flight) -> No
 
 
 def test_parameter_is_read_by_index_too(flight: Flight) -> None:
-    index = sorted(DEFAULTS).index("MAV_SYS_ID")
+    index = NAMES.index("MAV_SYS_ID")
     flight.send(mavlink.MAVLink_param_request_read_message(1, 1, b"", index))
     flight.run(0.02)
     assert flight.last("PARAM_VALUE").param_id == "MAV_SYS_ID"
@@ -96,13 +100,27 @@ def test_unknown_name_or_wrong_type_gets_no_answer_and_changes_nothing(
     assert flight.autopilot.parameters.number("COM_OF_LOSS_T") == 1.0
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "kind", "error"),
+    [("NO_SUCH_PARAM", 1.0, REAL32, 1), ("COM_OBL_RC_ACT", 5.0, REAL32, 7), ("COM_OF_LOSS_T", as_float(2), INT32, 7)],
+)
+def test_of_versions_that_say_it_a_wrong_setting_is_answered_by_an_error(
+    name: str, value: float, kind: int, error: int
+) -> None:
+    flight = Flight(px4="1.18")
+    flight.run(5.0)
+    assert write(flight, name, value, kind) == []
+    (said,) = flight.of("PARAM_ERROR")
+    assert (said.param_id, said.error) == (name, error)
+
+
 def test_unknown_parameter_is_not_answered(flight: Flight) -> None:
     assert read(flight, "NO_SUCH_PARAM") == []
     assert flight.of("PARAM_ERROR") == []
 
 
 def test_since_1_18_an_unknown_parameter_is_answered_by_an_error() -> None:
-    flight = Flight(px4_version="1.18")
+    flight = Flight(px4="1.18")
     flight.run(5.0)
     assert read(flight, "NO_SUCH_PARAM") == []
     (error,) = flight.of("PARAM_ERROR")
@@ -175,7 +193,7 @@ def test_no_value_of_a_parameter_stops_the_autopilot(value: float) -> None:
     flight = Flight()
     flight.take_off()
     flight.go_offboard()
-    for name, default in DEFAULTS.items():
+    for name, default in defaults(OLDEST).items():
         if isinstance(default, float):
             write(flight, name, value, REAL32)
             flight.stream(flight.setpoint(vx=1.0, vz=-0.2), 0.1)

@@ -16,7 +16,7 @@ from companion.wire import mavlink as wire
 from companion.wire import px4
 from companion.wire.mavlink import MavlinkCodec
 from companion.wire.mavlink_frames import Layout
-from companion.wire.px4 import Px4Mode, mode_name
+from companion.wire.px4 import Px4Mode, Software, mode_name
 
 SYSTEM_ID = 7
 
@@ -358,13 +358,18 @@ def as_pymavlink_reads(message: Any) -> list[wire.Event]:
             return [wire.ParameterValue(message.param_id, message.param_value)] if isfinite(message.param_value) else []
         case "PARAM_VALUE" if message.param_type == dialect.MAV_PARAM_TYPE_INT32:
             return [wire.ParameterValue(message.param_id, int.from_bytes(message.get_msgbuf()[10:14], "little"))]
+        case "AUTOPILOT_VERSION":
+            git = (
+                bytes(reversed(message.flight_custom_version)).hex()[:10] if any(message.flight_custom_version) else ""
+            )
+            return [Software(*message.flight_sw_version.to_bytes(4, "big"), git)]
         case "PARAM_ERROR":
             ours = message.target_component in (0, 191) and message.error
             return [wire.ParameterError(message.param_id)] if ours else []
     return []
 
 
-ALL_READ = (0, 1, 2, 22, 32, 49, 77, 111, 230, 242, 245, 345, 436)
+ALL_READ = (0, 1, 2, 22, 32, 49, 77, 111, 148, 230, 242, 245, 345, 436)
 
 
 @settings(max_examples=1000, deadline=None)
@@ -457,7 +462,7 @@ def test_every_layout_is_the_one_in_pymavlinks_dialect() -> None:
         kind = dialect.mavlink_map[layout.message_id]
         assert layout.extra == bytes((kind.crc_extra,))
         # A parameter's value is looked at as bytes; what nobody reads at a message's end is left out.
-        assert kind.unpacker.format.startswith(layout.fields.format.replace("4s", "f"))
+        assert kind.unpacker.format.startswith(layout.fields.format.replace("4s", "f").replace("8s", "8B"))
 
 
 @pytest.mark.parametrize(("told", "means"), [(0, 0), (55, 55), (100, 100), (-1, -1), (-5, -1), (101, -1), (127, -1)])

@@ -10,7 +10,7 @@ from math import dist, inf
 from companion.config import FleetConfig
 from companion.config.derived import Vehicle
 from companion.core.counts import Counts, summed
-from companion.core.events import AutopilotRebooted, Event, OriginMoved
+from companion.core.events import AutopilotIdentified, AutopilotRebooted, Event, OriginMoved
 from companion.core.failsafe import DAMAGE_M, HEARTBEAT_S, STALE_S, STATUS_S
 from companion.core.frames import Geodetic, LocalFrame, Ned
 from companion.core.values import ZERO, Instant, SafeSetpoint
@@ -28,6 +28,7 @@ from companion.vehicle.autopilot.port import (
     Outcome,
     Verb,
 )
+from companion.vehicle.autopilot.px4_identity import Px4Identity
 from companion.vehicle.autopilot.px4_parameters import PARAMETERS, ParameterRows, identity_checks
 from companion.vehicle.autopilot.px4_versions import same_setting
 from companion.vehicle.autopilot.requests import STREAM, Requests
@@ -35,7 +36,7 @@ from companion.vehicle.autopilot.round_trips import RoundTrips
 from companion.wire import mavlink as wire
 from companion.wire import px4
 from companion.wire.mavlink import MavlinkCodec
-from companion.wire.px4 import Px4Mode, mode_name
+from companion.wire.px4 import Px4Mode, Software, mode_name
 
 CLOCK_SAMPLES = 5
 FLAGS_NEEDED = 1 | 2 | 4
@@ -80,6 +81,7 @@ class Px4Autopilot:
         self.events: list[Event] = []
         self.requests = Requests(self.codec.command, self.counts, self.events)
         self.parameters = ParameterReader(PARAMETERS, same_setting)
+        self.identity = Px4Identity()
         self.armed = False
         self.custom_mode = 0
         self.intended_mode: int | None = None
@@ -106,8 +108,7 @@ class Px4Autopilot:
         self.position_ns: int | None = None
         self.position_ned_m = ZERO
         self.velocity_ned_m_s = ZERO
-        self._next_heartbeat_ns = 0
-        self._next_origin_ns = 0
+        self._next_heartbeat_ns = self._next_origin_ns = 0
         self._origin_doubted = False
         self._round_trips = RoundTrips()
         self._clock_ahead_ns: deque[int] = deque(maxlen=CLOCK_SAMPLES)
@@ -151,6 +152,9 @@ class Px4Autopilot:
                     self.parameters.take(message.name, message.value)
                 case wire.ParameterError():
                     self.parameters.refused(message.name)
+                case Software():
+                    if self.identity.take(message):
+                        self.events.append(AutopilotIdentified(f"PX4 {message}"))
                 case wire.TimeAnswer():
                     if not self._round_trips.answered(message.asked_ns, now.monotonic_ns):
                         self.counts["time answer to nothing asked"] += 1
@@ -161,14 +165,13 @@ class Px4Autopilot:
         return Heard(ours, fresh)
 
     def _heartbeat(self, message: wire.Heartbeat, now: Instant) -> None:
-        first = self.heartbeat_ns is None
+        if self.heartbeat_ns is None:
+            self._set_up()
         self.requests.heartbeat_ns = now.monotonic_ns
         self.armed = message.armed
         self.custom_mode = message.custom_mode
         self.kind = message.autopilot
         self.vehicle_type = message.vehicle_type
-        if first:
-            self._set_up()
 
     def _set_up(self) -> None:
         """Ask for what we read, and for no more: a companion's link may be a serial line."""
@@ -200,6 +203,7 @@ class Px4Autopilot:
             self.frame = None
         self.requests.cancel()
         self.parameters.restart()
+        self.identity.restart()
         self._round_trips.restart()
         self._clock_ahead_ns.clear()
         self.home_altitude_amsl_m = None
@@ -280,8 +284,10 @@ class Px4Autopilot:
         return out
 
     def _preflight_due(self, now_ns: int) -> list[bytes]:
-        """On the ground: the link's round trip once a second, and the parameters."""
+        """On the ground: the link's round trip once a second, which PX4 it is, and the parameters."""
         out = [self.codec.time_request(now_ns)] if self._round_trips.ask(now_ns) else []
+        if self.identity.ask(now_ns):
+            out.append(self.codec.command(*px4.request_message_parameters(px4.VERSION_MESSAGE_ID)))
         return out + [self.codec.read_parameter(name) for name in self.parameters.due(now_ns)]
 
     def next_deadline_ns(self) -> int:
@@ -290,7 +296,7 @@ class Px4Autopilot:
         if self.heartbeat_ns is not None and self._asks_origin:
             times.append(self._next_origin_ns)
         if self.heartbeat_ns is not None and not self.armed:
-            times += [self._round_trips.deadline_ns, self.parameters.next_deadline_ns()]
+            times += [self._round_trips.deadline_ns, self.parameters.next_deadline_ns(), self.identity.deadline_ns()]
         return min(times)
 
     def setpoint(self, setpoint: SafeSetpoint) -> bytes:
@@ -371,12 +377,12 @@ class Px4Autopilot:
 
     def facts(self, now: Instant) -> AutopilotFacts:
         """What preflight judges."""
-        is_px4 = self.kind == px4.AUTOPILOT_PX4
+        settings = self._settings.of(self.parameters.values, self.parameters.missing, self.identity)
         return AutopilotFacts(
             heartbeat_age_s=self.heartbeat_age_s(now),
             foreign_system_id=self.codec.foreign_system_id if _within(self.foreign_ns, HEARTBEAT_S, now) else None,
             identity=identity_checks(self.kind, self.vehicle_type),
-            settings=self._settings.of(self.parameters.values, self.parameters.missing) if is_px4 else (),
+            settings=settings if self.kind == px4.AUTOPILOT_PX4 else (),
             estimate=self.estimate(now),
             rc_healthy=bool(self.sensors_health & RC_RECEIVER_FLAG) and _within(self.health_ns, STATUS_S, now),
             origin=self.origin,

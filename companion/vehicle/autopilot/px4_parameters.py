@@ -9,7 +9,8 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from companion.config import FleetConfig
-from companion.vehicle.autopilot.px4_versions import same_setting
+from companion.vehicle.autopilot.px4_identity import Px4Identity
+from companion.vehicle.autopilot.px4_versions import NEWEST, Px4Version, same_setting
 from companion.wire import px4
 from companion.wire.operator import Check, tidy
 
@@ -32,7 +33,8 @@ PARAMETERS = (
 """PX4 parameters that preflight reads"""
 
 
-def _one_of(*allowed: int) -> tuple[str, Callable[[float], bool]]:
+def _one_of(*numbers: int) -> tuple[str, Callable[[float], bool]]:
+    allowed = sorted(numbers)
     text = f"{', '.join(str(a) for a in allowed[:-1])} or {allowed[-1]}"
     return text, lambda value: value in allowed
 
@@ -45,14 +47,22 @@ HOLD_ON_LOSS = 5
 """COM_OBL_RC_ACT"""
 
 
-def parameter_rules(config: FleetConfig, on_loss: float | None = None) -> dict[str, Rule]:
+FALLS_IN_AN_EMERGENCY = 4
+"""COM_LOW_BAT_ACT"""
+
+
+def parameter_rules(config: FleetConfig, on_loss: float | None = None, version: Px4Version = NEWEST) -> dict[str, Rule]:
     """Parameter -> its rule; those of a pilot's transmitter depend on `preflight.require_rc`.
 
     `on_loss`: the autopilot's COM_OBL_RC_ACT, on which COM_LOW_BAT_ACT's depends: what holds must end some day.
     """
     limits, pilot = config.limits, config.preflight.require_rc
     longest = config.preflight.offboard_loss_limit_s
-    low_battery = Rule(*_one_of(0, 2, 3), "not an action of PX4's")
+    falls = FALLS_IN_AN_EMERGENCY in version.battery_actions
+    low_battery = Rule(
+        *_one_of(*version.battery_actions - {FALLS_IN_AN_EMERGENCY}),
+        f"{FALLS_IN_AN_EMERGENCY} stops the motors in an emergency" if falls else "not an action of this PX4's",
+    )
     if on_loss == HOLD_ON_LOSS:
         low_battery = Rule(
             *_one_of(2, 3),
@@ -69,9 +79,12 @@ def parameter_rules(config: FleetConfig, on_loss: float | None = None) -> dict[s
             "the others of a way back",
         ),
         "COM_RC_OVERRIDE": Rule("has bit 1", lambda v: bool(int(v) & 2), "a pilot's sticks would not end OFFBOARD"),
-        "MAN_OVERRIDE_SPD": Rule(">= 0", lambda v: v >= 0.0, "a pilot's sticks would not end OFFBOARD"),
+        "MAN_OVERRIDE_SPD": Rule(
+            ">= 0 (sticks moved that fast)", lambda v: v >= 0.0, "a pilot's sticks would not end OFFBOARD"
+        ),
         "NAV_RCL_ACT": Rule(
-            *(_one_of(1, 2, 3) if pilot else _one_of(0, 1, 2, 3)), "lost RC must not end in a fall, nor in nothing"
+            *_one_of(*version.rc_loss_actions, *(() if pilot else (0,))),
+            "lost RC must not end in a fall, nor in nothing" if pilot else "lost RC must not end in a fall",
         ),
         "COM_RCL_EXCEPT": Rule(
             "any, with RC" if pilot else "has bit 2", lambda v: pilot or bool(int(v) & 4),
@@ -102,11 +115,11 @@ def identity_checks(kind: int, vehicle_type: int) -> tuple[Check, ...]:
 
 
 def parameter_checks(
-    values: Mapping[str, float | int], missing: AbstractSet[str], config: FleetConfig
+    values: Mapping[str, float | int], missing: AbstractSet[str], config: FleetConfig, version: Px4Version = NEWEST
 ) -> Iterator[Check]:
     """A row for each setting that was read or cannot be; one more while some are still asked for."""
     waiting = set()
-    for name, rule in parameter_rules(config, values.get("COM_OBL_RC_ACT")).items():
+    for name, rule in parameter_rules(config, values.get("COM_OBL_RC_ACT"), version).items():
         value = values.get(name)
         if value is not None:
             met = rule.meets(value)
@@ -121,7 +134,7 @@ def parameter_checks(
         if not set(names) <= missing:
             waiting.add(names)
         elif name == names[0]:
-            yield Check(name, None, rule.limit, False, f"{' or '.join(names)} cannot be read")
+            yield Check(name, None, rule.limit, False, f"{' or '.join(names)} cannot be read: {rule.why}")
     if waiting:
         wanted = len({same_setting(name) for name in PARAMETERS})
         says = f"{len(waiting)} of {wanted} parameters not read yet"
@@ -129,19 +142,22 @@ def parameter_checks(
 
 
 class ParameterRows:
-    """The rows of one vehicle, made anew when a parameter has changed: every status looks at them."""
+    """The rows of one vehicle, made anew when what they tell of has changed: every status looks at them."""
 
     def __init__(self, config: FleetConfig, vehicle_id: int) -> None:
         self._config = config
         self._vehicle_id = vehicle_id
-        self._known: tuple[dict[str, float | int], set[str]] | None = None
-        """what the rows tell of: values read, and names that cannot be"""
+        self._known: tuple[dict[str, float | int], set[str], Check] | None = None
+        """what the rows tell of: values read, names that cannot be, and the version"""
         self._rows: tuple[Check, ...] = ()
 
-    def of(self, values: Mapping[str, float | int], missing: AbstractSet[str]) -> tuple[Check, ...]:
-        """The rows of these parameters."""
-        if self._known != (values, missing):
-            rows = parameter_checks(values, missing, self._config)
+    def of(
+        self, values: Mapping[str, float | int], missing: AbstractSet[str], identity: Px4Identity
+    ) -> tuple[Check, ...]:
+        """The rows of this PX4 with these parameters."""
+        version = identity.check(values)
+        if self._known != (values, missing, version):
+            rows = (version, *parameter_checks(values, missing, self._config, identity.row(values)))
             self._rows = tuple(replace(row, vehicle=self._vehicle_id) for row in rows)
-            self._known = dict(values), set(missing)
+            self._known = dict(values), set(missing), version
         return self._rows
