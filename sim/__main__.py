@@ -50,13 +50,17 @@ def up(
     logs: Annotated[
         bool, typer.Option("--logs", help="With --autopilot px4: keep each PX4's flight log (ULog, 25 MB a minute).")
     ] = False,
+    first_instance: Annotated[
+        int | None,
+        typer.Option(min=0, max=200, help="PX4 instance number of the first vehicle: for a second fleet beside one."),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of gusts, noise and estimator origins.")] = 0,
     calm: Annotated[bool, typer.Option("--calm", help="No gusts, no wind and no sensor noise.")] = False,
     gcs: Annotated[
         bool, typer.Option("--gcs", help="Show the stubs to a ground station on UDP 14550 and to PX4's 3D viewer.")
     ] = False,
     scenario: Annotated[
-        Path | None, typer.Option(help="Faults of the stubs: a TOML file with tables [[fault]].")
+        Path | None, typer.Option(help="Faults of autopilots and companions: a TOML file with tables \\[[fault]].")
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder for the flight's folder.")] = Path("flights"),
     allow_missing: Annotated[
@@ -94,6 +98,7 @@ def up(
         for table, key, value in (
             ("formation", "shape", formation),
             ("plan", "legs", None if plan is None else plan_legs(plan)),
+            ("launch", "first_instance", first_instance),
         ):
             if value is not None and isinstance(tables.setdefault(table, {}), dict):
                 tables[table][key] = value
@@ -109,8 +114,10 @@ def up(
         config = parse(tables, fleet.name)
     if autopilot == "stub":
         check_stub_links(config)
-    elif gcs or scenario is not None:
-        raise ConfigError("--gcs and --scenario are for --autopilot stub: a PX4 speaks to the ground station by itself")
+    elif gcs:
+        raise ConfigError("--gcs is for --autopilot stub: a PX4 speaks to the ground station by itself")
+    elif scenario is not None and autopilot == "external":
+        raise ConfigError("--scenario is for --autopilot stub or px4: nobody here can harm what runs elsewhere")
     faults = () if scenario is None else load_scenario(scenario, config)
     interrupted = _interrupts()
     with only_flight(config.fleet.name):
@@ -178,17 +185,26 @@ def fault(
     duration: Annotated[
         float | None, typer.Option("--for", min=0, help="Seconds that a lasting fault lasts; 0 ends it.")
     ] = None,
+    wind: Annotated[
+        tuple[float, float], typer.Option(help="Of a wind: where the air flows to, north and east, m/s.")
+    ] = (0.0, 0.0),
     fleet: FleetFile = FLEET_TOML,
     vehicles: Vehicles = None,
 ) -> None:
-    """Have a stub autopilot of a running fleet suffer a fault; exit status 1 if it does not answer."""
+    """Have a stub or a simulated PX4 of a running fleet suffer a fault; exit status 1 if it does not answer."""
     from companion.config.overrides import fleet_config
+    from companion.core.frames import Ned
     from sim.launch.faults import order_fault
 
     if kind not in tuple(FaultKind):
         raise ConfigError(f"fault must be one of {', '.join(FaultKind)}, got {kind!r}")
     config = fleet_config(fleet, vehicles)
-    order_fault(config, vehicle, Fault(FaultKind(kind), magnitude, float("inf") if duration is None else duration))
+    lasts_s = float("inf") if duration is None else duration
+    try:
+        ordered = Fault(FaultKind(kind), magnitude, lasts_s, wind_ned_m_s=Ned(*wind, 0.0))
+    except ValueError as error:
+        raise ConfigError(str(error)) from None
+    order_fault(config, vehicle, ordered)
     tell(f"vehicle {vehicle}: {kind}")
 
 
@@ -200,6 +216,7 @@ def sitl(
     parameter: Parameters = None,
     ready: Annotated[Path | None, typer.Option(help="A file to make once every parameter is read back.")] = None,
     logs: Annotated[bool, typer.Option("--logs", help="Have the instances write their flight logs.")] = False,
+    relay: Annotated[list[int] | None, typer.Option(help="A vehicle whose link can be cut.")] = None,
 ) -> None:
     """Run PX4 SITL instances until standard input closes: for launchers."""
     from companion.config.overrides import fleet_config
@@ -210,7 +227,14 @@ def sitl(
     config = fleet_config(fleet)
     parameters = parse_parameters(parameter or ())
     settings = SitlSettings(
-        find_build(px4), truth.parent, truth, sys.stdin.fileno(), parameters, logs=logs, ready_path=ready
+        find_build(px4),
+        truth.parent,
+        truth,
+        sys.stdin.fileno(),
+        parameters,
+        logs=logs,
+        relayed=frozenset(relay or ()),
+        ready_path=ready,
     )
     SitlHost(config, settings).run(grace_s=1.5)
 
@@ -227,14 +251,28 @@ def study(
     out: Annotated[Path, typer.Option(help="Folder for tables, figures and the report.")] = Path("studies"),
     jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     setup: Annotated[Path | None, typer.Option(help="Your own copy of the study's TOML file.")] = None,
+    autopilot: Annotated[str, typer.Option(help="What flies the campaign: stub, or px4 (SITL).")] = "stub",
+    px4: Annotated[
+        Path | None, typer.Option(help="With --autopilot px4: its build folder, or /opt/px4; else looked for.")
+    ] = None,
 ) -> None:
     """Reproduce the paper's results and compare ours: tables, figures, a report. Finished seeds are not run again.
 
     Needs the extra `study` of starling-fleet.
     """
+    from sim.launch.px4_build import find_build
     from sim.study.run import study as run
 
-    run(name, seeds, out, jobs, setup)
+    if autopilot not in ("stub", "px4"):
+        raise ConfigError(f"--autopilot must be stub or px4, got {autopilot!r}")
+    if autopilot == "px4" and name != "campaign":
+        raise ConfigError(f"--autopilot px4 is for the campaign alone, got the study {name!r}")
+    if px4 is not None and autopilot != "px4":
+        raise ConfigError("--px4 needs --autopilot px4")
+    if autopilot == "px4":
+        run("campaign_px4", seeds, out, jobs, setup, px4=find_build(px4))
+    else:
+        run(name, seeds, out, jobs, setup)
 
 
 law = typer.Typer(no_args_is_help=True, help="Laws, ours and those of installed packages.")

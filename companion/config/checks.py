@@ -14,6 +14,9 @@ from companion.core.trajectory.successors import with_legs
 from companion.core.trajectory_check import PLAN_SPEED_SHARE, TURN_RATE_MIN_DEG_S, Fault, examine
 from companion.errors import ConfigError
 
+SYSTEM_ID_MAX = 250
+"""above are those of ground stations"""
+
 
 def faults(config: FleetConfig) -> list[str]:
     """All that is wrong with a file whose values are each in range; what follows from another fault is left out."""
@@ -56,8 +59,13 @@ def _table_faults(config: FleetConfig) -> Iterator[str]:
         yield "$.vehicle: at least one vehicle must be enabled"
     taken: dict[tuple[str, object], int] = {}
     for k, v in enumerate(config.vehicle):
-        system_id = v.id if v.system_id is None else v.system_id
-        link = v.mavlink or f"udp://127.0.0.1:{companion_port(k)}"
+        system_id = v.id + config.launch.first_instance if v.system_id is None else v.system_id
+        if system_id > SYSTEM_ID_MAX:
+            yield (
+                f"$.vehicle[{k}]: its MAVLink system id would be {system_id}, may be {SYSTEM_ID_MAX}: a lower id, or "
+                "a lower $.launch.first_instance"
+            )
+        link = v.mavlink or f"udp://127.0.0.1:{companion_port(config.launch.first_instance + k)}"
         udp, serial = udp_endpoint(link), serial_endpoint(link)
         if udp is None and serial is None:
             yield f"$.vehicle[{k}].mavlink must be udp://HOST:PORT or serial:///dev/NAME:BAUD, got {link!r}"

@@ -44,7 +44,7 @@ class Vehicle(Table):
 
     id: int
     instance: int
-    """position in the file, from 0: ports and pads follow it"""
+    """`launch.first_instance` and the position in the file: ports follow it"""
     system_id: int
     mavlink: str
     zenoh: str | None
@@ -62,13 +62,13 @@ class FleetConfig(FleetBounds):
     @cached_property
     def vehicles(self) -> tuple[Vehicle, ...]:
         """The enabled vehicles, in the file's order."""
-        pads = self._grid_pads()
+        pads, first = self._grid_pads(), self.launch.first_instance
         return tuple(
             Vehicle(
                 id=v.id,
-                instance=k,
-                system_id=v.id if v.system_id is None else v.system_id,
-                mavlink=v.mavlink or f"udp://127.0.0.1:{companion_port(k)}",
+                instance=first + k,
+                system_id=v.id + first if v.system_id is None else v.system_id,
+                mavlink=v.mavlink or f"udp://127.0.0.1:{companion_port(first + k)}",
                 zenoh=v.zenoh,
                 slot=v.slot,
                 pad_north_m=pads[k].north if v.pad_m is None else v.pad_m[0],

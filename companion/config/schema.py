@@ -215,6 +215,8 @@ class LaunchTable(Table):
 
     spacing_m: Positive = 4.0
     heading_deg: Real = 0.0
+    first_instance: Annotated[int, Field(ge=0, le=200)] = 0
+    """PX4's instance number of the first vehicle: a second simulated fleet on one machine needs numbers of its own"""
 
 
 class StubTable(Table):

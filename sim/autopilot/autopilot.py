@@ -22,7 +22,7 @@ from sim.autopilot.dynamics import Vehicle
 from sim.autopilot.dynamics_parameters import DynamicsParameters
 from sim.autopilot.estimator import Estimator
 from sim.autopilot.events import EventReporter
-from sim.autopilot.faults import LASTING, Fault, FaultKind
+from sim.autopilot.faults import LASTING, OF_PX4_ALONE, Fault, FaultKind
 from sim.autopilot.flight import Flight
 from sim.autopilot.lasting_faults import LastingFaults
 from sim.autopilot.link import COMPONENT_ID, Link, StreamSchedule
@@ -84,6 +84,7 @@ class Autopilot:
         self._utc_offset_ns = utc_offset_ns
         self._fleet_origin = fleet_origin
         self._ekf_origin_offset_m = ekf_origin_offset_m
+        self._dynamics = dynamics
         self._seed = f"{seed}/{system_id}"
         self._boots = 0
         self.version = version_named(px4)
@@ -106,6 +107,7 @@ class Autopilot:
     def _boot(self) -> None:
         """Everything that a boot sets up; the vehicle itself stays where it is."""
         self._boots += 1
+        self.vehicle.parameters = self._dynamics
         self.now_ns = 0
         """time since boot, on the grid"""
         self._steps = 0
@@ -130,7 +132,7 @@ class Autopilot:
         self._flight = Flight(self.commander, self.navigator, self.vehicle, self.telemetry)
         self._origin_announced = False
         self._home_set = False
-        self._faults = LastingFaults(self._estimator, self.telemetry, self.link)
+        self._faults = LastingFaults(self._estimator, self.telemetry, self.link, self.vehicle)
         self._reboot_wanted = False
         self._apply_parameters()
         self._estimator.step(0)
@@ -140,6 +142,8 @@ class Autopilot:
     def receive(self, datagram: bytes, now_ns: int) -> None:
         """Takes what arrived from the link at `now_ns`; answers wait for the next `advance`."""
         self._catch_up(now_ns)
+        if self.link.deaf:
+            return
         if is_one_frame(datagram) and datagram[7:10] == SETPOINT_KEY and self.link.mav.buf_len() == 0:
             # What comes many times a second is read without pymavlink's objects; what is damaged goes the long way.
             values = unpacked(SETPOINT, datagram)
@@ -199,7 +203,9 @@ class Autopilot:
         )
 
     def inject(self, fault: Fault) -> None:
-        """Breaks something from now on, for as long as the fault says."""
+        """Breaks something from now on, for as long as the fault says; ValueError for what a stub does not play."""
+        if fault.kind in OF_PX4_ALONE:
+            raise ValueError(f"{fault.kind} is for --autopilot px4: a stub does not play it")
         if fault.kind in LASTING:
             self._faults.order(fault, self.now_ns)
             return

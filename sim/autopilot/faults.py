@@ -33,6 +33,14 @@ class FaultKind(StrEnum):
     """the pilot's kill switch"""
     SLOW_LINK = "slow_link"
     """the link carries magnitude bytes/s towards the companion (5760, a radio at 57600 baud)"""
+    LINK_LOST = "link_lost"
+    """nothing passes the link, either way"""
+    WIND = "wind"
+    """the air flows with wind_ned_m_s; afterwards as before"""
+    GPS_STUCK = "gps_stuck"
+    """the receiver repeats its last fix; of a PX4 alone, which is told so by MAV_CMD_INJECT_FAILURE"""
+    GPS_WRONG = "gps_wrong"
+    """the receiver tells of a fix in two dimensions; of a PX4 alone"""
 
 
 DEFAULT_MAGNITUDE = {
@@ -49,10 +57,18 @@ LASTING = frozenset(
         FaultKind.LOW_BATTERY,
         FaultKind.MUTE,
         FaultKind.SLOW_LINK,
+        FaultKind.LINK_LOST,
+        FaultKind.WIND,
+        FaultKind.GPS_STUCK,
+        FaultKind.GPS_WRONG,
     }
 )
 """faults that have an end; the others happen at once"""
+OF_PX4_ALONE = frozenset({FaultKind.GPS_STUCK, FaultKind.GPS_WRONG})
+"""what a stub does not play"""
 DEFAULT_OFFSET_NED_M = Ned(4.0, -3.0, 0.5)
+CALM = Ned(0.0, 0.0, 0.0)
+WIND_MAX_M_S = 30.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,12 +82,16 @@ class Fault:
     """how long a lasting fault lasts, s; 0 ends one that is there"""
     offset_ned_m: Ned = DEFAULT_OFFSET_NED_M
     """of an estimator reset: how far the origin moves, m"""
+    wind_ned_m_s: Ned = CALM
+    """of a wind: where the air flows to, level, m/s"""
 
     def __post_init__(self) -> None:
         if not self.duration_s >= 0.0:
             raise ValueError(f"duration_s must be >= 0 s, got {self.duration_s}")
         if self.magnitude is not None and not 0.0 <= self.magnitude < math.inf:
             raise ValueError(f"magnitude must be >= 0, got {self.magnitude}")
+        if not (all(abs(x) <= WIND_MAX_M_S for x in self.wind_ned_m_s) and self.wind_ned_m_s.down == 0.0):
+            raise ValueError(f"wind_ned_m_s must be level and at most {WIND_MAX_M_S:g} m/s, got {self.wind_ned_m_s}")
 
     @property
     def strength(self) -> float:
@@ -85,6 +105,7 @@ def encode_order(vehicle_id: int, fault: Fault) -> bytes:
         "vehicle": vehicle_id,
         "kind": fault.kind.value,
         "offset_ned_m": list(fault.offset_ned_m),
+        "wind_ned_m_s": list(fault.wind_ned_m_s),
     }
     if fault.magnitude is not None:
         order["magnitude"] = fault.magnitude
@@ -101,7 +122,7 @@ def decode_order(line: bytes) -> tuple[int, Fault]:
     order = json.loads(line)
     if not isinstance(order, dict):
         raise ValueError(f"a fault is ordered by a JSON object, got {order!r}")
-    allowed = {"vehicle", "kind", "magnitude", "duration_s", "offset_ned_m"}
+    allowed = {"vehicle", "kind", "magnitude", "duration_s", "offset_ned_m", "wind_ned_m_s"}
     if unknown := set(order) - allowed:
         raise ValueError(f"unknown keys {sorted(unknown)}, allowed are {sorted(allowed)}")
     vehicle_id, kind = order.get("vehicle"), order.get("kind")
@@ -115,4 +136,5 @@ def decode_order(line: bytes) -> tuple[int, Fault]:
         None if magnitude is None else float(magnitude),
         float(order.get("duration_s", math.inf)),
         Ned(*(float(value) for value in order.get("offset_ned_m", DEFAULT_OFFSET_NED_M))),
+        Ned(*(float(value) for value in order.get("wind_ned_m_s", CALM))),
     )

@@ -30,6 +30,8 @@ class Link:
         self.now_ns = 0
         """time since boot, kept by the autopilot"""
         self.muted = False
+        self.deaf = False
+        """what arrives is lost"""
         self.bytes_per_s = math.inf
         self._waiting: deque[tuple[int, bytes]] = deque()
         self._free_ns = 0

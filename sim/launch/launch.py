@@ -1,12 +1,13 @@
 """A whole fleet on one machine: stubs and companions as processes, from take-off to the summary."""
 
 import json
+import signal
 import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -20,14 +21,15 @@ from companion.config.file import parse
 from companion.errors import CompanionError, RefusedError
 from companion.io.network import operator_link
 from companion.operator.client import Operator
+from sim.autopilot.faults import FaultKind
 from sim.autopilot.stubs import TRUTH_DTYPE
-from sim.launch.faults import ScheduledFault
+from sim.launch.faults import CompanionFault, CompanionFaultKind, ScheduledFault
 from sim.launch.jobs import CompanionJob, ReferenceJob, StubsJob
 from sim.launch.processes import END_TIMEOUT_S, FleetProcesses
 from sim.launch.reference_loop import read_reference_loop
 from sim.launch.summary.flight import Flight
 from sim.launch.summary.summarise import summarise
-from sim.launch.watch import MissingError, Progress, Watch
+from sim.launch.watch import LANDING_TIMEOUT_S, MissingError, Progress, Watch
 
 READY_TIMEOUT_S = 30.0
 READY_TIMEOUT_PER_VEHICLE_S = 3.0
@@ -56,11 +58,13 @@ class FlightOptions:
     ground: bool = False
     """show the stubs to a ground station and PX4's viewer"""
     faults: tuple[ScheduledFault, ...] = ()
-    """what the stubs suffer, and when after the take-off command"""
+    """what autopilots and companions suffer, and when after the take-off command"""
     allow_missing: bool = False
     """fly without the vehicles that do not come"""
     logs: bool = False
     """keep the SITL instances' flight logs"""
+    landing_s: float = LANDING_TIMEOUT_S
+    """after the operator's landing command nobody is waited for any longer"""
 
 
 def flight_folder(root: Path) -> Path:
@@ -106,6 +110,9 @@ class _Launch:
     show: Callable[[Progress], None]
     interrupted: Callable[[], bool]
     tell: Callable[[str], None]
+    starts: dict[int, int] = field(default_factory=dict)
+    """vehicle -> how often its companion was started, where more than once"""
+    _niceness: int = 0
 
     @property
     def _file(self) -> Path:
@@ -133,7 +140,8 @@ class _Launch:
             with operator_link(config) as link:
                 watch = Watch(
                     Operator(config, link), self.processes, ids, self.show, began_s, since_s, self._ready,
-                    allow_missing=self.options.allow_missing, tell=self.tell,
+                    allow_missing=self.options.allow_missing, tell=self.tell, harm=self._harm,
+                    landing_s=self.options.landing_s,
                 )  # fmt: skip
                 try:
                     answers = watch.take_off(READY_TIMEOUT_S + READY_TIMEOUT_PER_VEHICLE_S * len(ids), self.interrupted)
@@ -162,20 +170,41 @@ class _Launch:
             more = [word for p in options.parameters for word in ("--parameter", p)]
             self.processes.spawn(
                 "autopilots", "sim", "sitl", "--fleet", file, "--px4", str(options.px4), "--truth", str(self._truth),
-                "--ready", str(self._ready), *more, *(["--logs"] if options.logs else []),
+                "--ready", str(self._ready), *more, *(["--logs"] if options.logs else []), *self._relays(),
             )  # fmt: skip
         elif not options.external:
             self.processes.fork("autopilots", StubsJob(file, options.seed, str(self._truth), options.ground))
+
+    def _relays(self) -> list[str]:
+        """Options for the vehicles whose link a scenario cuts."""
+        cut = {f.vehicle_id for f in self.options.faults if f.fault.kind is FaultKind.LINK_LOST}
+        return [word for i in sorted(cut) for word in ("--relay", str(i))]
 
     def _start_companions(self, ids: list[int]) -> None:
         for i in ids:
             if self.interrupted():
                 raise CompanionError("interrupted before take-off")
             job = CompanionJob(i, str(self._file), str(self._recording(i)))
-            self.processes.fork(f"companion-{i}", job, CROWD_NICENESS if len(ids) > CROWD else 0)
+            self._niceness = CROWD_NICENESS if len(ids) > CROWD else 0
+            self.processes.fork(f"companion-{i}", job, self._niceness)
 
-    def _recording(self, vehicle_id: int) -> Path:
-        return self.options.folder / f"vehicle-{vehicle_id}.mcap"
+    def _recording(self, vehicle_id: int, start: int = 1) -> Path:
+        """A companion that starts anew records into a file of its own."""
+        return self.options.folder / f"vehicle-{vehicle_id}{'' if start == 1 else f'-{start}'}.mcap"
+
+    def _recordings(self, vehicle_id: int) -> list[Path]:
+        return [self._recording(vehicle_id, k) for k in range(1, self.starts.get(vehicle_id, 1) + 1)]
+
+    def _harm(self, vehicle_id: int, fault: CompanionFault) -> None:
+        name = f"companion-{vehicle_id}"
+        if fault.kind is CompanionFaultKind.STOPPED:
+            self.processes.stop(name, fault.duration_s)
+            return
+        self.processes.end([name], 0.0, signal.SIGKILL)
+        if fault.kind is CompanionFaultKind.RESTARTED:
+            start = self.starts[vehicle_id] = self.starts.get(vehicle_id, 1) + 1
+            job = CompanionJob(vehicle_id, str(self._file), str(self._recording(vehicle_id, start)))
+            self.processes.fork(name, job, self._niceness)
 
     def _leave_out(self, tables: dict[str, Any], ids: list[int], missing: Mapping[int, str]) -> FleetConfig:
         """End the companions, which wait for the missing, and write the file of those who are there."""
@@ -217,7 +246,7 @@ class _Launch:
             versions={"python": sys.version.split()[0], **{name: version(name) for name in LIBRARIES}},
         )
         for i in watch.ids:
-            flight.read_file(i, self._recording(i))
+            flight.read_files(i, self._recordings(i))
             flight.rejected += Counter(watch.said[i].rejected if i in watch.said else {})
         rows = read_reference_loop(options.folder / "reference.bin")
         flight.reference_lateness_ns = rows[rows[:, 0] >= watch.asked_ns, 1].astype(float)
@@ -225,6 +254,8 @@ class _Launch:
             **summarise(flight),
             "missing": dict(missing),
             "exit_status": {i: self.processes.exit_status(f"companion-{i}") for i in watch.ids},
+            "takeoff_ns": watch.asked_ns,
+            "faults_refused": watch.refused,
             "folder": str(options.folder),
             "flight_logs": {i: _flight_logs(options.folder / f"px4-{i}") for i in watch.ids} if options.logs else {},
         }

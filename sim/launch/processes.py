@@ -6,6 +6,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
@@ -162,10 +163,19 @@ class FleetProcesses:
         how = "is there" if status is None else f"ended {when} with {how_it_ended(status)}:"
         return "\n".join((f"{name} {how}", *last_lines(self.folder / f"{name}.log")))
 
-    def end(self, names: list[str], timeout_s: float) -> None:
-        """SIGTERM to each, and SIGKILL to whoever is still there after the timeout."""
+    def stop(self, name: str, seconds: float) -> None:
+        """Have a child stand still for a while."""
+        child = self.children[name]
+        child.send_signal(signal.SIGSTOP)
+        timer = threading.Timer(seconds, child.send_signal, (signal.SIGCONT,))
+        timer.daemon = True
+        timer.start()
+
+    def end(self, names: list[str], timeout_s: float, how: int = signal.SIGTERM) -> None:
+        """A signal to each, and SIGKILL to whoever is still there after the timeout; whoever stands still goes on."""
         for name in names:
-            self.children[name].send_signal(signal.SIGTERM)
+            self.children[name].send_signal(how)
+            self.children[name].send_signal(signal.SIGCONT)
         deadline_s = time.monotonic() + timeout_s
         waiting = set(names)
         while waiting:

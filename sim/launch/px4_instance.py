@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from math import isfinite
 from pathlib import Path
 
-from companion.config.endpoints import autopilot_port, companion_port
+from companion.config.endpoints import autopilot_port
 from companion.core.frames import Geodetic
 from companion.errors import CompanionError, ConfigError
 from companion.terminal import one_line
@@ -94,11 +94,14 @@ class Px4Instance:
             self.state_link = self._mavlink("start", "-x", "-u", own, *speed, "-o", str(port)).returncode == 0
         return self.state_link
 
-    def open_offboard_link(self) -> None:
-        """Past ten instances: a link of its own in place of the one that PX4's scripts send to one port for all."""
-        self._mavlink("stop", "-u", str(OFFBOARD_PORT + self.index))  # PX4 has room for six links
+    def open_offboard_link(self, to_port: int) -> None:
+        """A link to that port, in place of the one that PX4's scripts have opened; on the ground only.
+
+        Past ten instances those send to one port for all. PX4 has room for six links, so that the old one goes first.
+        """
+        self._mavlink("stop", "-u", str(OFFBOARD_PORT + self.index))
         own, speed = str(autopilot_port(self.index)), ("-r", "4000000", "-f", "-m", "onboard")
-        done = self._mavlink("start", "-x", "-u", own, *speed, "-o", str(companion_port(self.index)))
+        done = self._mavlink("start", "-x", "-u", own, *speed, "-o", str(to_port))
         if done.returncode != 0:
             said = f"{done.stdout}{done.stderr}".strip()
             raise CompanionError(f"PX4 instance {self.index} opens no link on {own}: {said}")
@@ -133,6 +136,11 @@ class Px4Instance:
         """SIGTERM, from which PX4 ends in about two seconds."""
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGTERM)
+
+    def kill(self) -> None:
+        """End it at once, as if its computer had lost power."""
+        self.process.kill()
+        self.end()
 
     def end(self) -> None:
         """End it, with SIGKILL if need be, and wait until it is gone."""

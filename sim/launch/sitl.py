@@ -22,29 +22,24 @@ import numpy as np
 from pymavlink.dialects.v20 import development as mavlink
 
 from companion.config import FleetConfig
-from companion.config.derived import Vehicle
-from companion.core.frames import Geodetic, Ned, geodetic_to_ned, ned_to_geodetic
+from companion.core.frames import Geodetic, geodetic_to_ned
 from companion.errors import CompanionError
-from companion.io.link import SO_TIMESTAMPNS, received_unix_ns
+from companion.io.link import received_unix_ns
 from companion.wire.mavlink_frames import HEAD_2
-from companion.wire.px4 import interval_parameters, parameter_value
+from companion.wire.px4 import parameter_value
 from sim.autopilot.stubs import TRUTH_DTYPE
 from sim.launch.ended import tell_ended
-from sim.launch.px4_build import sitl_parameters
-from sim.launch.px4_instance import STATE_PORT, Px4Instance
+from sim.launch.sitl_faults import answer_orders
+from sim.launch.sitl_vehicle import CURRENT_MODE, SitlVehicle, bind
 
-TRUTH_PORT = 19410
-PX4_PORTS = 10
-"""instances for which PX4's own scripts open an offboard link of their own"""
 STARTUP_TIMEOUT_S = 30.0
 FLUSH_INTERVAL_NS = 500_000_000
-RECEIVE_BUFFER_BYTES = 1 << 20
-CURRENT_MODE = 436
+ROUND_S = 0.5
+"""between two requests for what has not come"""
 STATE_MESSAGES = frozenset({0, 22, 30, 77, 245, CURRENT_MODE})
 """HEARTBEAT, PARAM_VALUE, ATTITUDE, COMMAND_ACK, EXTENDED_SYS_STATE and CURRENT_MODE"""
 TRUTH_MESSAGES = frozenset({115})
 """HIL_STATE_QUATERNION"""
-MODE_RATE_HZ = 20.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,61 +56,11 @@ class SitlSettings:
     """beyond what `px4_build` has for a fleet on this build, or instead of one of them"""
     logs: bool = False
     """whether the instances write their logs (ULog)"""
+    relayed: frozenset[int] = frozenset()
+    """vehicles whose link can be cut"""
     ready_path: Path | None = None
     """a file that is made once every parameter was read back as set"""
     log: Callable[[str], None] = print
-
-
-class _Instance:
-    """One vehicle's PX4 with its truth socket, and what it has said."""
-
-    def __init__(self, config: FleetConfig, vehicle: Vehicle, settings: SitlSettings) -> None:
-        self.vehicle = vehicle
-        self.index = vehicle.instance
-        if vehicle.system_id != self.index + 1:
-            raise CompanionError(
-                f"vehicle {vehicle.id}: PX4 instance {self.index} has system id {self.index + 1}, "
-                f"fleet.toml says {vehicle.system_id}"
-            )
-        self.truth_socket = _bind(TRUTH_PORT + self.index, f"vehicle {vehicle.id}'s truth")
-        home = ned_to_geodetic(Ned(vehicle.pad_north_m, vehicle.pad_east_m, 0.0), config.origin)
-        self.parameters = {**sitl_parameters(settings.build, logs=settings.logs), **settings.parameters}
-        try:
-            self.px4 = Px4Instance(
-                self.index, home, settings.build, settings.folder / f"px4-{vehicle.id}", self.parameters
-            )
-        except BaseException:
-            self.truth_socket.close()
-            raise
-        self.armed = False
-        self.custom_mode = 0
-        self.landed_state = 1
-        self.checked: dict[str, float | int] = {}
-        self.clock: list[tuple[float, float]] = []
-        """(UTC s, the simulation's s), first and latest"""
-        self.mode_streamed = False
-        self.missed = False
-        """whether its early end has been told"""
-
-    def ran_at(self) -> float | None:
-        """Simulated per real time so far."""
-        if len(self.clock) < 2:
-            return None
-        (real0, sim0), (real1, sim1) = self.clock
-        return (sim1 - sim0) / max(real1 - real0, 1e-9)
-
-
-def _bind(port: int, whose: str) -> socket.socket:
-    s = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    s.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
-    s.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
-    try:
-        s.bind(("127.0.0.1", port))
-    except OSError as error:
-        s.close()
-        raise CompanionError(f"cannot listen on UDP 127.0.0.1:{port} for {whose}: {error.strerror}") from error
-    s.setblocking(False)
-    return s
 
 
 class SitlHost:
@@ -128,16 +73,19 @@ class SitlHost:
         self._mav: Any = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
         self._mav.robust_parsing = True
         self._flushed_ns = 0
+        self._next_round_s = 0.0
         try:
-            self._states = _bind(0, "the instances' state")
+            self._states = bind(0, "the instances' state")
             self._stack.callback(self._states.close)
             self._states_port: int = self._states.getsockname()[1]
             self._file = self._stack.enter_context(settings.truth_path.open("ab"))
-            self.instances: list[_Instance] = []
+            self.instances: list[SitlVehicle] = []
             for vehicle in config.vehicles:
-                instance = _Instance(config, vehicle, settings)
-                self._stack.callback(instance.truth_socket.close)
-                self._stack.callback(instance.px4.end)
+                instance = SitlVehicle(
+                    config, vehicle, settings.build, settings.folder, settings.parameters, self._send,
+                    logs=settings.logs, relayed=vehicle.id in settings.relayed,
+                )  # fmt: skip
+                self._stack.callback(instance.close)
                 self.instances.append(instance)
         except BaseException:
             self._stack.close()
@@ -150,13 +98,10 @@ class SitlHost:
         for s in (signal.SIGTERM, signal.SIGINT):
             signal.signal(s, lambda *_: ended.append(True))
         with self._stack:
-            if not self._read_back_parameters(ended):
+            if not self._bring_up(ended):
                 return
             if self.settings.ready_path is not None:
                 self.settings.ready_path.touch()
-            for instance in self.instances:
-                if instance.index >= PX4_PORTS:
-                    instance.px4.open_offboard_link()
             until: float | None = None
             stop_fds = [self.settings.stop_fd]
             while until is None or time.monotonic() < until:
@@ -165,6 +110,7 @@ class SitlHost:
                     stop_fds = []
                     until = time.monotonic() + (grace_s if until is None else 0.0)
                 self._tell_missing()
+                self._serve_faults()
             for instance in self.instances:
                 instance.px4.ask_to_end()
                 factor = instance.ran_at()
@@ -180,13 +126,16 @@ class SitlHost:
                 tell_ended(self.settings.folder, instance.vehicle.id, f"PX4 ended with status {status}")
 
     def _serve(self, timeout_s: float, stop_fds: Sequence[int]) -> bool:
-        sockets: list[Any] = [self._states, *(i.truth_socket for i in self.instances)]
+        sockets: list[Any] = [self._states, *(s for i in self.instances for s in i.sockets)]
         ready, _, _ = select.select([*sockets, *stop_fds], [], [], timeout_s)
         if self._states in ready:
             self._read_states()
         for instance in self.instances:
             if instance.truth_socket in ready:
                 self._read_truth(instance)
+            instance.serve_relay(ready)
+            if instance.orders in ready:
+                answer_orders(instance.orders, instance.faults, time.monotonic())
         return any(fd in ready and not os.read(fd, 4096) for fd in stop_fds)
 
     def _messages(self, s: socket.socket, wanted: frozenset[int]) -> Iterator[tuple[int, Any]]:
@@ -226,7 +175,7 @@ class SitlHost:
                 case mavlink.MAVLink_param_value_message():
                     instance.checked[message.param_id.rstrip("\x00")] = told_value(message)
 
-    def _read_truth(self, instance: _Instance) -> None:
+    def _read_truth(self, instance: SitlVehicle) -> None:
         rows = []
         for time_unix_ns, message in self._messages(instance.truth_socket, TRUTH_MESSAGES):
             if isinstance(message, mavlink.MAVLink_hil_state_quaternion_message):
@@ -247,49 +196,42 @@ class SitlHost:
             self._flushed_ns = now_ns
             self._file.flush()
 
-    def _read_back_parameters(self, ended: Sequence[bool]) -> bool:
+    def _serve_faults(self) -> None:
+        """End those whose time is over, and bring up whoever has booted anew."""
+        now_s = time.monotonic()
+        for instance in self.instances:
+            instance.faults.end_due(now_s)
+        if now_s >= self._next_round_s:
+            self._next_round_s = now_s + ROUND_S
+            for instance in self.instances:
+                if not instance.up and not instance.missed:
+                    instance.bring_up(self._states_port)
+
+    def _bring_up(self, ended: Sequence[bool]) -> bool:
         """Wait until every parameter set at the start has arrived, and for CURRENT_MODE at a rate worth recording.
 
         False when ended meanwhile; CompanionError names vehicle and parameter that did not arrive.
         """
         deadline = time.monotonic() + STARTUP_TIMEOUT_S
-        command, *interval = interval_parameters(CURRENT_MODE, MODE_RATE_HZ)
         while time.monotonic() < deadline:
-            waiting = [i for i in self.instances if _missing(i) or not i.mode_streamed]
+            waiting = [i for i in self.instances if not i.up]
             if not waiting:
                 return True
             for instance in waiting:
                 if instance.px4.process.poll() is not None:
                     raise CompanionError(f"vehicle {instance.vehicle.id}: {instance.px4.last_words()}")
-                if not instance.px4.open_state_link(self._states_port):
-                    continue
-                system_id = instance.vehicle.system_id
-                if not instance.mode_streamed:
-                    self._ask(instance, mavlink.MAVLink_command_long_message(
-                        system_id, 1, command, 0, *interval, 0.0, 0.0, 0.0, 0.0, 0.0
-                    ))  # fmt: skip
-                for name in _missing(instance):
-                    self._ask(instance, mavlink.MAVLink_param_request_read_message(system_id, 1, name.encode(), -1))
-            until = time.monotonic() + 0.5
+                instance.bring_up(self._states_port)
+            until = time.monotonic() + ROUND_S
             while time.monotonic() < until:
                 if self._serve(0.1, [self.settings.stop_fd]) or ended:
                     return False
-        missing = {i.vehicle.id: _missing(i) for i in self.instances if _missing(i)}
+        missing = {i.vehicle.id: i.not_as_set for i in self.instances if i.not_as_set}
         raise CompanionError(f"PX4 parameters not as set after {STARTUP_TIMEOUT_S:.0f} s: {missing or 'silent'}")
 
-    def _ask(self, instance: _Instance, message: Any) -> None:
-        self._states.sendto(message.pack(self._mav), ("127.0.0.1", STATE_PORT + instance.index))
+    def _send(self, message: Any, port: int) -> None:
+        self._states.sendto(message.pack(self._mav), ("127.0.0.1", port))
 
 
 def told_value(message: Any) -> float | int:
     """Value of a PARAM_VALUE by its frame's bytes: as a float, an integer that is a signalling NaN's loses a bit."""
     return parameter_value(bytes(message.get_msgbuf()[HEAD_2 : HEAD_2 + 4]), message.param_type)
-
-
-def _missing(instance: _Instance) -> dict[str, float | int | None]:
-    """Parameters that were not read back as set, with what was read."""
-    return {
-        name: instance.checked.get(name)
-        for name, value in instance.parameters.items()
-        if name not in instance.checked or not abs(instance.checked[name] - value) <= 1e-6
-    }

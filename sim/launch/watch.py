@@ -1,7 +1,7 @@
 """The launcher's eye on a flight: who is missing, who is ready, who has gone, when all is over."""
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from companion.errors import CompanionError
 from companion.operator.client import Answers, Operator, PreflightError
 from companion.wire.operator import Status
 from sim.launch.ended import read_ended
-from sim.launch.faults import ScheduledFault, order_fault
+from sim.launch.faults import CompanionFault, ScheduledFault, order_fault
 from sim.launch.processes import FleetProcesses
 
 MISSING_AFTER_S = 12.0
@@ -63,8 +63,13 @@ class Watch:
     ready: Path | None = None
     """a file that is there once the autopilots have their parameters; None: nobody sets any here"""
     allow_missing: bool = False
+    landing_s: float = LANDING_TIMEOUT_S
     tell: Callable[[str], None] = lambda _: None
     """says what cannot wait for the live table, once"""
+    harm: Callable[[int, CompanionFault], None] = lambda _, __: None
+    """has a companion's process suffer a fault"""
+    refused: list[str] = field(default_factory=list)
+    """faults that were ordered, and not carried out"""
     said: dict[int, Status] = field(default_factory=dict)
     """each vehicle's last account"""
     asked_ns: int = 0
@@ -181,15 +186,32 @@ class Watch:
             if staying and all(done) and len(staying) + len(gone & frozenset(self.ids)) == len(self.ids):
                 return lost
             while coming and self.clock() - start >= coming[0].at_s:
-                order_fault(self.operator.config, coming[0].vehicle_id, coming[0].fault)
-                coming.pop(0)
+                self._suffer(coming.pop(0))
             over = duration_s is not None and self.clock() - start >= duration_s
             if landing_since is None and (over or interrupted()):
                 landing_since = self.clock()
                 self.operator.land()
-            if landing_since is not None and self.clock() - landing_since > LANDING_TIMEOUT_S:
+            if landing_since is not None and self.clock() - landing_since > self.landing_s:
                 return lost
-            self.sleep(POLL_S)
+            self.sleep(self._until_next(coming, start))
+
+    def _until_next(self, coming: Sequence[ScheduledFault], start: float) -> float:
+        """How long to wait for the next look: a fault comes at its time."""
+        if not coming:
+            return POLL_S
+        return min(max(start + coming[0].at_s - self.clock(), 0.0), POLL_S)
+
+    def _suffer(self, scheduled: ScheduledFault) -> None:
+        """Carry out one line of a scenario; of one that cannot be, a word is said and the flight goes on."""
+        fault = scheduled.fault
+        if isinstance(fault, CompanionFault):
+            self.harm(scheduled.vehicle_id, fault)
+            return
+        try:
+            order_fault(self.operator.config, scheduled.vehicle_id, fault)
+        except CompanionError as error:
+            self.refused.append(f"fault {fault.kind} at {scheduled.at_s:g} s: {error}")
+            self.tell(self.refused[-1])
 
 
 def _absence(status: Status | None) -> str | None:

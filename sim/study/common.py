@@ -23,7 +23,7 @@ from scipy.stats import beta
 from companion.config.law_tables import LAWS
 from companion.config.registry import Origin
 from companion.errors import ConfigError
-from sim.study import FLOWN_STUDIES, STUDIES
+from sim.study import FLOWN, FLOWN_STUDIES, STUDIES
 from sim.swarm.setup import Setup, connected, setup_from
 from sim.swarm.swarm import Run, kernels
 
@@ -187,7 +187,7 @@ def writable_folder(out: Path) -> Path:
 
 def study_module(name: str) -> ModuleType:
     """The code of a study: `piece(config, seed)` and `finish(config, pieces, seeds)`."""
-    if name not in STUDIES + FLOWN_STUDIES:
+    if name not in STUDIES + FLOWN:
         raise ConfigError(f"there is no study {name!r}; known are {', '.join(STUDIES + FLOWN_STUDIES)} and all")
     return importlib.import_module(f"sim.study.{name}")
 
@@ -196,7 +196,7 @@ def fingerprint(config: Config) -> str:
     """Names a set-up together with the code that runs it: a piece of one is never taken for a piece of another."""
     digest = blake2s(digest_size=8)
     digest.update(config.text.encode())
-    if config.name not in FLOWN_STUDIES:
+    if config.name not in FLOWN:
         kernels()
         from sim.swarm.compiled import source_hash
 

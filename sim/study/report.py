@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from sim.study import FLOWN_STUDIES
+from sim.study import FLOWN
 from sim.study.common import Config, Outcome, Table, study_module
 
 _STYLE = """
@@ -31,7 +31,7 @@ def write_report(out: Path, name: str, done: Sequence[tuple[Config, Outcome]], s
         f"{seeds[0]}..{seeds[-1]}" if list(seeds) == list(range(seeds[0], seeds[-1] + 1)) else ",".join(map(str, seeds))
     )
     body = [f"<h1>Starling formations: {'every study' if name == 'all' else html.escape(done[0][0].name)}</h1>"]
-    flown = all(c.name in FLOWN_STUDIES for c, _ in done)
+    flown = all(c.name in FLOWN for c, _ in done)
     chosen = "" if flown else "Parameters were chosen on seeds 0..19 only; claims are judged on 20..39. "
     body.append(
         f"<p>Seeds {text}. {chosen}Every random number comes from seed and vehicle index, so all laws meet the same "

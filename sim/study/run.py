@@ -6,7 +6,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from companion.errors import CompanionError, ConfigError
-from sim.study import FLOWN_STUDIES, STUDIES
+from sim.study import FLOWN, STUDIES
 from sim.study.common import (
     Config,
     Outcome,
@@ -31,8 +31,9 @@ def study(
     jobs: int = 1,
     setup: Path | None = None,
     console: Console | None = None,
+    px4: Path | None = None,
 ) -> Path:
-    """Run one study, or `all`; returns the report's path.
+    """Run one study, or `all`; returns the report's path. `px4`: PX4's build folder, for what flies on one.
 
     Raises ConfigError with a sentence for what is refused, CompanionError after the report is written if a rule that
     must hold was broken.
@@ -46,8 +47,10 @@ def study(
         raise ConfigError(f"--jobs must be at least 1, got {jobs}")
     chosen = parse_seeds((JUDGED_SEEDS if name == "all" else DEFAULT_SEEDS) if seeds is None else seeds)
     configs = [load_config(each, setup) for each in names]
+    if px4 is not None:
+        configs = [study_module(each.name).with_build(each, px4) for each in configs]
     folder = writable_folder(out)
-    if not set(names) <= set(FLOWN_STUDIES):
+    if not set(names) <= set(FLOWN):
         kernels()
     console = console or Console()
     done: list[tuple[Config, Outcome]] = []

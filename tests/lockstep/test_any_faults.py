@@ -15,16 +15,16 @@ from companion.core.safety.filter import COLLISION_DISTANCE_M
 from companion.core.values import FLYING_PHASES, Instant, Phase
 from companion.wire.mavlink import ON_GROUND
 from companion.wire.px4 import Px4Mode
-from sim.autopilot.faults import Fault, FaultKind
+from sim.autopilot.faults import OF_PX4_ALONE, Fault, FaultKind
 from sim.lockstep.clockwork import UTC_AT_START_NS
 from sim.lockstep.lockstep import Lockstep
-from sim.study.campaign import ESTIMATE_FAULTS
+from sim.study.campaign_faults import ESTIMATE_FAULTS
 
 pytestmark = pytest.mark.timeout(600)
 """flights are simulated within a test, on whatever machine"""
 
 IDS = st.sampled_from([1, 2])
-BLINDING = [kind for kind in FaultKind if kind.value in ESTIMATE_FAULTS]
+BLINDING = [kind for kind in FaultKind if kind.value in ESTIMATE_FAULTS and kind not in OF_PX4_ALONE]
 FENCE = {"radius_m": 15.0, "floor_m": 1.0, "ceiling_m": 8.0}
 ENDED_S = 120.0
 
@@ -73,7 +73,7 @@ class AnyFaults(RuleBasedStateMachine):
 
     @rule(
         i=IDS,
-        kind=st.sampled_from([*BLINDING, FaultKind.MUTE]),
+        kind=st.sampled_from([*BLINDING, FaultKind.MUTE, FaultKind.LINK_LOST]),
         duration_s=st.sampled_from([0.4, 1.0, 4.0]),
     )
     def break_autopilot(self, i: int, kind: FaultKind, duration_s: float) -> None:

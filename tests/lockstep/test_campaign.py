@@ -11,9 +11,10 @@ import pytest
 from rich.console import Console
 
 from companion.errors import CompanionError, ConfigError
-from sim.study import campaign
+from sim.study import campaign, campaign_faults
 from sim.study.attacks import PLANS
-from sim.study.campaign import Drawn, drawn_faults, flight_of, fly
+from sim.study.campaign import fly
+from sim.study.campaign_faults import Drawn, drawn_faults, flight_of
 from sim.study.common import load_config
 from sim.study.run import study
 
@@ -71,8 +72,8 @@ def test_a_seed_draws_the_same_one_to_three_faults_each_time_within_their_window
 def test_a_kind_that_is_left_out_changes_only_the_faults_that_were_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
     flight = flight_of(load_config("campaign"))
     with_all = [drawn_faults(flight, seed) for seed in range(200)]
-    fewer = {kind: own for kind, own in reversed(campaign.EXPLAINED.items()) if kind != "forged_plan"}
-    monkeypatch.setattr(campaign, "EXPLAINED", fewer)
+    fewer = {kind: own for kind, own in reversed(campaign_faults.EXPLAINED.items()) if kind != "forged_plan"}
+    monkeypatch.setattr(campaign_faults, "EXPLAINED", fewer)
     for seed, faults in enumerate(with_all):
         kept = [f for f in faults if f.kind != "forged_plan"]
         assert all(f in drawn_faults(flight, seed) for f in kept)

@@ -90,7 +90,7 @@ def damage(data: bytes, rng: random.Random) -> bytes:
 
 def read_by_all(path: Path, config: FleetConfig) -> ReplayResult | None:
     """What each reader makes of a file; None where it is refused."""
-    Flight(config, 0, np.zeros(0, TRUTH_DTYPE), 0).read_file(1, path)
+    Flight(config, 0, np.zeros(0, TRUTH_DTYPE), 0).read_files(1, [path])
     try:
         return replay_file(path)
     except RecordingError as error:
@@ -140,7 +140,7 @@ def test_entries_that_a_full_disk_took_are_told_as_missing_and_not_as_a_differen
     assert (result.difference, result.same, lost > 0) == (None, False, True)
     assert f"the same; {lost} entries are missing {then}, so nothing behind them can be compared" in result.sentence()
     flight = Flight(recorded.config, 0, np.zeros(0, TRUTH_DTYPE), 0)
-    flight.read_file(1, path)
+    flight.read_files(1, [path])
     assert flight.unrecorded == {1: f"{lost} entries are missing {then}"}
 
 

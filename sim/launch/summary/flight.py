@@ -2,7 +2,7 @@
 
 import struct
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -92,17 +92,22 @@ class Flight:
     unrecorded: dict[int, str] = field(default_factory=dict)
     """vehicle -> what its recording lacks"""
 
-    def read_file(self, vehicle_id: int, path: Path) -> None:
-        """Take one companion's recording as far as it is there; what it lacks is told in the summary."""
-        try:
-            recording = read_recording(path)
-            self.read(vehicle_id, recording.entries)
-            gaps = list(recording.gaps())
-        except RecordingError as error:
-            self.unrecorded[vehicle_id] = str(error)
-        else:
-            if gaps:
-                self.unrecorded[vehicle_id] = "; ".join(gap.sentence() for gap in gaps[:GAPS_TOLD_MOST])
+    def read_files(self, vehicle_id: int, paths: Sequence[Path]) -> None:
+        """Take the recordings of one vehicle's companion, one for each of its starts, as far as they are there; what
+        they lack is told in the summary."""
+        ticks, traffic, lacking = [], [], []
+        for path in paths:
+            try:
+                recording = read_recording(path)
+                self.read(vehicle_id, recording.entries)
+                lacking += [gap.sentence() for gap in recording.gaps()]
+            except RecordingError as error:
+                lacking.append(str(error))
+            ticks.append(self.ticks.pop(vehicle_id, np.zeros(0, TICK_ROWS)))
+            traffic.append(self.traffic.pop(vehicle_id, np.zeros(0, TRAFFIC_ROWS)))
+        self.ticks[vehicle_id], self.traffic[vehicle_id] = np.concatenate(ticks), np.concatenate(traffic)
+        if lacking:
+            self.unrecorded[vehicle_id] = "; ".join(lacking[:GAPS_TOLD_MOST])
 
     def read(self, vehicle_id: int, entries: Iterable[Entry]) -> None:
         """Take one companion's recording; RecordingError for an entry that cannot be read, all before it is taken."""
