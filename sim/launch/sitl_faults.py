@@ -21,7 +21,7 @@ from companion.errors import CompanionError
 from companion.wire.px4 import Px4Mode, mode_parameters
 from sim.autopilot.faults import LASTING, Fault, FaultKind, decode_order
 
-ORDER_PORT = 24900
+ORDER_PORT = 25100
 """UDP port on which the host takes orders for instance i: this plus i"""
 GPS_UNIT, BATTERY_UNIT = 4, 100
 """FAILURE_UNIT"""

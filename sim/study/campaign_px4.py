@@ -51,7 +51,8 @@ CALM_AFTER_S = 4.0
 LANDING_S = 20.0
 """the operator waits no longer for those who are somebody else's"""
 STALLED_MOST_S = 3.0
-INSTANCES_APART = 10
+FIRST_INSTANCE, INSTANCES_APART = 40, 10
+"""beside whatever else flies on this machine"""
 SLOTS = 8
 """flights at a time, each with instance numbers of its own"""
 TRIES = 2
@@ -199,7 +200,7 @@ def fly_px4(flight: Flight, seed: int, build: Path, slot: int = 0, keep: Path | 
     faults = drawn_faults(flight, seed)
     tables = campaign_tables(flight, missing)
     tables["fleet"]["name"] = f"campaign-px4-{os.getpid()}-{slot}"
-    tables["launch"] = {"first_instance": slot * INSTANCES_APART}
+    tables["launch"] = {"first_instance": FIRST_INSTANCE + slot * INSTANCES_APART}
     tables["limits"] = {}
     ids = [v["id"] for v in tables["vehicle"]]
     with tempfile.TemporaryDirectory(prefix="campaign-") as scratch:
