@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from companion.errors import CompanionError, libraries_of
+from companion.errors import CompanionError, ConfigError, libraries_of
 from companion.operator import verbs
 from companion.terminal import tell, tolerate_any_encoding
 
@@ -19,6 +19,11 @@ app = typer.Typer(
 operator_app = typer.Typer(no_args_is_help=True, help="Command and ask a running fleet, without the simulator.")
 verbs.mount(operator_app)
 app.add_typer(operator_app, name="operator")
+signing_app = typer.Typer(no_args_is_help=True, help="Keys by which a vehicle's MAVLink link is signed.")
+app.add_typer(signing_app, name="signing")
+SigningKey = Annotated[
+    Path | None, typer.Option("--signing-key", help="File of the link's key, before fleet.toml's signing_key.")
+]
 DIFFERENT = 1
 """a replay that differs, a check that is not met"""
 
@@ -28,6 +33,7 @@ def run(
     vehicle: Annotated[int, typer.Option(min=1, max=250, help="This vehicle's id in fleet.toml.")],
     fleet: Annotated[Path, typer.Option(help="The fleet's configuration.")] = Path("fleet.toml"),
     record: Annotated[Path | None, typer.Option(help="MCAP file for every input and output.")] = None,
+    signing_key: SigningKey = None,
     launched: Annotated[
         bool, typer.Option("--launched", help="End (and land) when standard input closes: for launchers.")
     ] = False,
@@ -44,7 +50,7 @@ def run(
     text = read_text(fleet)
     config = parse_text(text, fleet)
     stop_fd = sys.stdin.fileno() if launched else None
-    raise typer.Exit(fly_vehicle(config, vehicle, fleet, text, record=record, stop_fd=stop_fd))
+    raise typer.Exit(fly_vehicle(config, vehicle, fleet, text, record=record, stop_fd=stop_fd, signing_key=signing_key))
 
 
 @app.command()
@@ -53,6 +59,7 @@ def check(
     fleet: Annotated[Path, typer.Option(help="The fleet's configuration.")] = Path("fleet.toml"),
     seconds: Annotated[float, typer.Option(min=1, max=600, help="How long to listen to the autopilot.")] = 6.0,
     folder: Annotated[Path, typer.Option(help="Where recordings will go.")] = Path(),
+    signing_key: SigningKey = None,
     as_json: Annotated[bool, typer.Option("--json", help="Every row as JSON.")] = False,
 ) -> None:
     """Look the companion computer over: link, autopilot and its parameters, clock, network, disk. Flies nothing.
@@ -62,22 +69,58 @@ def check(
     """
     from companion.config import load
     from companion.io.check import hardware_checks
-    from companion.wire.operator import unmet
+    from companion.wire.operator import unmet, warnings
 
     config = load(fleet)
     rows = []
-    for row in hardware_checks(config, config.by_id(vehicle), seconds, folder):
+    one = config.by_id(vehicle)
+    for row in hardware_checks(config, one, seconds, folder, signing_key or one.signing_key_beside(fleet)):
         rows.append(row)
         if not as_json:
             value = "-" if row.value is None else row.value
-            tell(f"{'ok' if row.passed else 'FAULT':5}  {row.name:20}  {value!s:>20}  {row.limit}")
+            met = ("see" if row.warns else "ok") if row.passed else "FAULT"
+            tell(f"{met:5}  {row.name:20}  {value!s:>20}  {row.limit}")
     faults = unmet(rows)
     if as_json:
         typer.echo(json.dumps({"fit": not faults, "checks": [asdict(r) for r in rows]}))
     else:
-        for fault in faults:
-            tell(fault.message)
+        for row in (*warnings(rows), *faults):
+            tell(row.message)
     raise typer.Exit(DIFFERENT if faults else 0)
+
+
+@signing_app.command("make")
+def signing_make(file: Annotated[Path, typer.Argument(help="The key's new file.")]) -> None:
+    """Write a new random key, readable by this user alone; a file that is there is left as it is."""
+    from companion.io.signing_key import make_key
+
+    make_key(file)
+    tell(f"{file}: a new key. `companion signing give --vehicle N --signing-key {file}` has the autopilot learn it")
+
+
+@signing_app.command("give")
+def signing_give(
+    vehicle: Annotated[int, typer.Option(min=1, max=250, help="The vehicle's id in fleet.toml.")],
+    fleet: Annotated[Path, typer.Option(help="The fleet's configuration.")] = Path("fleet.toml"),
+    signing_key: SigningKey = None,
+    old: Annotated[Path | None, typer.Option(help="File of the key that the autopilot has now, to replace it.")] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask whether the link may be trusted.")] = False,
+) -> None:
+    """Have the autopilot sign, and demand signatures, by a key (SETUP_SIGNING). Disarmed only, over a cable.
+
+    The key travels in the clear: whoever hears this link has it. Exit status 1 if the autopilot does not sign by it.
+    """
+    from companion.config import load
+    from companion.io.signing_setup import give_key
+
+    config = load(fleet)
+    one = config.by_id(vehicle)
+    key_file = signing_key or one.signing_key_beside(fleet)
+    if key_file is None:
+        raise ConfigError(f"vehicle {vehicle} names no signing_key in {fleet}, and no --signing-key is given")
+    if not yes and not typer.confirm(f"The key goes over {one.mavlink} in the clear. Is it a cable that nobody taps?"):
+        raise typer.Exit(DIFFERENT)
+    tell(give_key(config, one, key_file, old))
 
 
 @app.command()

@@ -73,7 +73,7 @@ def up(
     Ctrl-C lands the fleet. Exit status: 0 the flight met its criteria, 1 it did not, 2 wrong usage or configuration.
     """
     from companion.config.file import parse
-    from companion.config.overrides import fleet_tables, plan_legs
+    from companion.config.overrides import existing_file, fleet_tables, plan_legs
     from sim.autopilot.stub_fleet import check_stub_links
     from sim.launch.faults import load_scenario
     from sim.launch.launch import FlightOptions, flight_folder, fly
@@ -104,6 +104,10 @@ def up(
                 tables[table][key] = value
 
     tables = fleet_tables(fleet, vehicles, change)
+    for row in tables.get("vehicle", ()):
+        if isinstance(row, dict) and isinstance(row.get("signing_key"), str):
+            # The flight's own copy of the file lies elsewhere.
+            row["signing_key"] = str((existing_file(fleet).parent / row["signing_key"]).resolve())
     if calm:
         tables.setdefault("stub", {}).update(
             position_noise_m=0.0, velocity_noise_m_s=0.0, gust_m_s2=0.0, wind_north_m_s=0.0, wind_east_m_s=0.0
@@ -172,7 +176,7 @@ def stub(
     run_stubs(
         stub_settings(
             config, seed=seed, truth_path=truth, stop_fd=sys.stdin.fileno() if launched else None,
-            grace_s=1.3 if launched else 0.0, ground=gcs,
+            grace_s=1.3 if launched else 0.0, ground=gcs, folder=fleet.parent,
         )
     )  # fmt: skip
 

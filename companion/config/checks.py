@@ -57,6 +57,8 @@ def _table_faults(config: FleetConfig) -> Iterator[str]:
         yield '$.fleet.origin is required with frame = "global" (latitude_deg, longitude_deg, altitude_amsl_m)'
     if not config.vehicles:
         yield "$.vehicle: at least one vehicle must be enabled"
+    if config.stub.signing and config.stub.px4 in ("1.16", "1.17"):
+        yield f'$.stub.signing needs $.stub.px4 = "1.18" or "main": PX4 v{config.stub.px4} signs nothing'
     taken: dict[tuple[str, object], int] = {}
     for k, v in enumerate(config.vehicle):
         system_id = v.id + config.launch.first_instance if v.system_id is None else v.system_id

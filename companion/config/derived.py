@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from functools import cached_property
 from hashlib import blake2s
 from math import ceil, inf, radians, sqrt
+from pathlib import Path
 from typing import Literal
 
 from companion.config.bounds import SPACING_MARGIN_M, FleetBounds
@@ -51,6 +52,11 @@ class Vehicle(Table):
     slot: int | Literal["auto"]
     pad_north_m: float
     pad_east_m: float
+    signing_key: str | None = None
+
+    def signing_key_beside(self, file: Path) -> Path | None:
+        """The file of its link's key: named by the configuration, in whose folder it lies unless its path is whole."""
+        return None if self.signing_key is None else file.parent / self.signing_key
 
 
 class FleetConfig(FleetBounds):
@@ -73,6 +79,7 @@ class FleetConfig(FleetBounds):
                 slot=v.slot,
                 pad_north_m=pads[k].north if v.pad_m is None else v.pad_m[0],
                 pad_east_m=pads[k].east if v.pad_m is None else v.pad_m[1],
+                signing_key=v.signing_key,
             )
             for k, v in enumerate(self.vehicle)
             if v.enabled

@@ -235,6 +235,8 @@ class StubTable(Table):
     dynamics: Literal["px4", "ideal"] = "px4"
     px4: Literal["1.16", "1.17", "1.18", "main"] = "1.16"
     """which PX4 the stubs play: its parameters, modes and answers"""
+    signing: bool = False
+    """they demand signed MAVLink; keys are made for vehicles that name none"""
 
 
 class VehicleTable(Table):
@@ -250,6 +252,8 @@ class VehicleTable(Table):
     slot: Annotated[int, Field(ge=0, le=249)] | Literal["auto"] = "auto"
     pad_m: tuple[Real, Real] | None = None
     """north, east of the fleet origin; None: the launch grid's next"""
+    signing_key: Annotated[str, Field(min_length=1, max_length=500)] | None = None
+    """file of the key by which its MAVLink link is signed, beside this file; None: it is not signed"""
     enabled: bool = True
 
 

@@ -10,7 +10,7 @@ import select
 import shutil
 import socket
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -18,8 +18,9 @@ from companion.config import FleetConfig
 from companion.config.derived import Vehicle
 from companion.errors import CompanionError
 from companion.io.clock import FleetClock
-from companion.io.link import Link, open_link
+from companion.io.link import Link
 from companion.io.network import operator_link
+from companion.io.signed_link import open_link
 from companion.vehicle.autopilot.adapters import open_autopilot
 from companion.vehicle.autopilot.port import AutopilotPort
 from companion.vehicle.preflight import own_checks
@@ -48,17 +49,19 @@ class _Timex(ctypes.Structure):
     )
 
 
-def hardware_checks(config: FleetConfig, vehicle: Vehicle, seconds: float, folder: Path) -> Iterator[Check]:
-    """Every row, as it is known; the autopilot is listened to for `seconds`."""
-    yield from _autopilot(config, vehicle, seconds)
+def hardware_checks(
+    config: FleetConfig, vehicle: Vehicle, seconds: float, folder: Path, key_file: Path | None = None
+) -> Iterator[Check]:
+    """Every row, as it is known; the autopilot is listened to for `seconds`, over a link signed by that key."""
+    yield from _autopilot(config, vehicle, seconds, key_file)
     yield clock_check(kernel_clock())
     yield from _network(config, vehicle)
     yield from disk_checks(folder)
 
 
-def _autopilot(config: FleetConfig, vehicle: Vehicle, seconds: float) -> Iterator[Check]:
+def _autopilot(config: FleetConfig, vehicle: Vehicle, seconds: float, key_file: Path | None) -> Iterator[Check]:
     try:
-        link = open_link(vehicle)
+        link = open_link(vehicle, key_file)
     except CompanionError as error:
         yield Check("link", vehicle.mavlink, "opens", False, f"{error} (is a companion running?)")
         return
@@ -70,9 +73,19 @@ def _autopilot(config: FleetConfig, vehicle: Vehicle, seconds: float) -> Iterato
         yield Check("bytes", received, "> 0", received > 0, f"nothing came on {vehicle.mavlink} in {seconds:g} s")
         damaged = autopilot.rejected.get("malformed", 0)
         yield Check("damaged frames", damaged, "= 0", damaged == 0, f"{damaged} frames came damaged: baud rate, cable?")
+        if key_file is not None:
+            yield signing_check(link.refused)
         yield from own_checks(autopilot.facts(clock.now()), config, vehicle)
     finally:
         link.close()
+
+
+def signing_check(refused: Mapping[str, int]) -> Check:
+    """Whether both ends sign by one key."""
+    wrong = {why: count for why, count in refused.items() if count}
+    told = ", ".join(f"{count} {why}" for why, count in wrong.items())
+    says = f"frames that are not believed: {told}. Has the autopilot another key, or none (`companion signing give`)?"
+    return Check("signing", told or "all believed", "all believed", not wrong, says)
 
 
 def listen(link: Link, autopilot: AutopilotPort, clock: FleetClock, seconds: float) -> int:

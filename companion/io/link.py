@@ -11,6 +11,8 @@ import socket
 import struct
 import termios
 import time
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Protocol
 
 from companion.config.derived import Vehicle
@@ -45,9 +47,21 @@ def received_unix_ns(ancillary: list[tuple[int, int, bytes]]) -> int:
 class Link(Protocol):
     """What the loop needs of a link."""
 
-    foreign_datagrams: int
-    """datagrams from elsewhere while the autopilot's address was known"""
-    send_failures: int
+    @property
+    def foreign_datagrams(self) -> int:
+        """Datagrams from elsewhere while the autopilot's address was known."""
+
+    @property
+    def send_failures(self) -> int:
+        """What could not be sent."""
+
+    @property
+    def refused(self) -> Mapping[str, int]:
+        """Frames that were not believed, by reason: of a link that is signed."""
+
+    @property
+    def fault(self) -> str:
+        """What an operator should know of it; mostly empty."""
 
     def fileno(self) -> int:
         """For select."""
@@ -68,7 +82,7 @@ class Link(Protocol):
         """Release the port."""
 
 
-def open_link(vehicle: Vehicle) -> Link:
+def open_bare_link(vehicle: Vehicle) -> Link:
     """The link of a vehicle's `mavlink` URL; CompanionError names the vehicle when it cannot be opened."""
     udp, serial = udp_endpoint(vehicle.mavlink), serial_endpoint(vehicle.mavlink)
     try:
@@ -80,7 +94,14 @@ def open_link(vehicle: Vehicle) -> Link:
         raise CompanionError(f"vehicle {vehicle.id}: {error}") from error
 
 
-class UdpLink:
+class _Bare:
+    """What links have that sign nothing."""
+
+    refused: Mapping[str, int] = MappingProxyType({})
+    fault = ""
+
+
+class UdpLink(_Bare):
     """Bound to the companion's port; speaks with the one address that has proved to be the autopilot's."""
 
     def __init__(self, host: str, port: int) -> None:
@@ -143,7 +164,7 @@ class UdpLink:
         self._socket.close()
 
 
-class SerialLink:
+class SerialLink(_Bare):
     """A serial line, raw, eight bits and no parity. One that is pulled out is opened anew when it is there again.
 
     It has one owner: two that read it would each hear a part of what is said. The lock ends with the process, as

@@ -26,10 +26,10 @@ from companion.core.values import Instant
 from companion.errors import CompanionError
 from companion.io.answers import Answers
 from companion.io.clock import FleetClock
-from companion.io.link import open_link
 from companion.io.network import peer_transport
 from companion.io.recorder import Recorder
 from companion.io.records import TickRecord, TrafficRecord, peer_body
+from companion.io.signed_link import open_link
 from companion.io.systemd import Notifier
 from companion.io.transport import Connect, Event, PresenceChange, ReceivedSample, Request, Sent
 from companion.vehicle.agent import Agent
@@ -59,6 +59,8 @@ class RunSettings:
     stop_fd: int | None = None
     """a file descriptor whose end of file means that the launcher is gone"""
     log: Callable[[str], None] = print
+    signing_key: Path | None = None
+    """the file of the link's key; None: nothing is signed"""
     configuration: Path | None = None
     """the file that the configuration was read from: a change of it in flight is noted"""
 
@@ -94,6 +96,7 @@ class Companion:
         self._file = self._configuration()
         self._file_due_ns = 0
         self._noticed: set[Failsafe] = set()
+        self._fault_told = False
         self._drain_failed = False
         """what waits at the transport is asked for again, though nothing wakes the loop for it"""
         with ExitStack() as stack:
@@ -102,7 +105,7 @@ class Companion:
             for end in (self._wake_read, self._wake_write):
                 end.setblocking(False)
                 stack.callback(end.close)
-            self.link = open_link(self.agent.vehicle)
+            self.link = open_link(self.agent.vehicle, settings.signing_key)
             stack.callback(self.link.close)
             if settings.record is not None:
                 self.recorder = self._open_recorder(settings.record, metadata, config)
@@ -312,6 +315,9 @@ class Companion:
         sent = self.guard.transport("sent", self.network.sent, self._sent[-1][1])
         self._sent.append((now_ns, sent))
         self._record("traffic", self._instant(now_ns), TrafficRecord(*sent).pack())
+        if self.link.fault and not self._fault_told:
+            self._fault_told = True
+            self._note(self._instant(now_ns), f"the time of signing is not kept: {self.link.fault}")
 
     def _notice(self, failsafe: Failsafe, now_ns: int) -> None:
         """Tell the agent, once, what only the process can see."""
@@ -337,6 +343,7 @@ class Companion:
             "peer: could not be sent": counters.publish_failures,
             "operator: could not be answered": counters.reply_failures,
         }
+        elsewhere |= {f"mavlink: {why}": count for why, count in self.link.refused.items()}
         rejected = {kind: count for kind, count in elsewhere.items() if count}
         (then_ns, then), (now_ns, sent) = self._sent[0], self._sent[-1]
         seconds = (now_ns - then_ns) * 1e-9

@@ -19,18 +19,20 @@ SWITCH_INTERVAL_S = 0.0005
 
 
 def fly_vehicle(
-    config: FleetConfig, vehicle_id: int, file: Path, text: str, *, record: Path | None, stop_fd: int | None
-) -> int:
+    config: FleetConfig, vehicle_id: int, file: Path, text: str, *, record: Path | None, stop_fd: int | None,
+    signing_key: Path | None = None,
+) -> int:  # fmt: skip
     """Fly until SIGTERM, SIGINT or the end of `stop_fd`; returns the exit status. Main thread only.
 
-    `text` is what the file of the configuration held when it was read.
+    `text` is what the file of the configuration held when it was read; `signing_key` goes before the file's own.
     """
 
     def log(line: str) -> None:
         # Not through a buffer, which on a full disk would fail again at the end and change the exit status.
         os.write(1, log_line(vehicle_id, line))
 
-    settings = RunSettings(vehicle_id, record, stop_fd, log, file)
+    key = signing_key or config.by_id(vehicle_id).signing_key_beside(file)
+    settings = RunSettings(vehicle_id, record, stop_fd, log, key, file)
     companion = Companion(config, settings, {"config": text, "version": product_version()})
     try:
         return run_in_process(companion)

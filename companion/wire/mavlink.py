@@ -166,6 +166,14 @@ HOME_POSITION = _layout(242, 104, "<iii")
 EXTENDED_SYS_STATE = _layout(245, 130, "<BB")
 PARAM_ERROR = _layout(345, 209, "<hBB16sB")
 CURRENT_MODE = _layout(436, 193, "<II")
+SETUP_SIGNING = _layout(256, 71, "<QBB32s")
+SENT = (HEARTBEAT, PARAM_REQUEST_READ, COMMAND_LONG, SET_POSITION_TARGET_LOCAL_NED, TIMESYNC, SETUP_SIGNING)
+"""what a companion says"""
+READ = (
+    LOCAL_POSITION_NED, CURRENT_MODE, EXTENDED_SYS_STATE, HEARTBEAT, GPS_GLOBAL_ORIGIN, ESTIMATOR_STATUS, SYS_STATUS,
+    COMMAND_ACK, PARAM_VALUE, PARAM_ERROR, TIMESYNC, SYSTEM_TIME, HOME_POSITION, AUTOPILOT_VERSION,
+)  # fmt: skip
+"""what it hears"""
 
 
 class MavlinkCodec:
@@ -299,6 +307,10 @@ class MavlinkCodec:
         """COMMAND_LONG (76); parameters left out are 0."""
         values = [*parameters, *([0.0] * (7 - len(parameters)))]
         return self._pack(COMMAND_LONG, *values, command, self.system_id, AUTOPILOT_COMPONENT_ID, 0)
+
+    def set_up_signing(self, key: bytes, ticks: int) -> bytes:
+        """SETUP_SIGNING: the autopilot is to sign by this key, and to believe nothing older than the time stamp."""
+        return self._pack(SETUP_SIGNING, ticks, self.system_id, AUTOPILOT_COMPONENT_ID, key)
 
     def read_parameter(self, name: str) -> bytes:
         """PARAM_REQUEST_READ (20) by name."""

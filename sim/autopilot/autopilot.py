@@ -32,8 +32,9 @@ from sim.autopilot.offboard import SetpointFields, decode_setpoint
 from sim.autopilot.packing import unpacked
 from sim.autopilot.parameters import ParameterTable, loop_gains
 from sim.autopilot.services import Services
+from sim.autopilot.signing import Signing
 from sim.autopilot.telemetry import Telemetry
-from sim.autopilot.truth import TruthState
+from sim.autopilot.truth import TruthState, minus, plus
 
 STEP_NS = 4_000_000
 """grid of the dynamics and of everything that is sent, ns"""
@@ -48,6 +49,8 @@ BATTERY_LOWEST_FRACTION = 0.5
 SETPOINT = mavlink.MAVLink_set_position_target_local_ned_message
 SETPOINT_KEY = SETPOINT.id.to_bytes(3, "little")
 NO_OFFSET = Ned(0.0, 0.0, 0.0)
+COMPANION_LINK, GROUND_LINK = 0, 1
+"""link ids of signatures"""
 
 
 class Autopilot:
@@ -67,6 +70,7 @@ class Autopilot:
         noise: NoiseParameters | None = None,
         parameters: Mapping[str, float | int] | None = None,
         px4: str = OLDEST.name,
+        signing_key: bytes | None = None,
         yaw_rad: float = 0.0,
         seed: int = 0,
     ) -> None:
@@ -88,9 +92,13 @@ class Autopilot:
         self._seed = f"{seed}/{system_id}"
         self._boots = 0
         self.version = version_named(px4)
+        if signing_key is not None and not self.version.signing:
+            raise ValueError(f'PX4 {px4} signs nothing: [stub] signing needs px4 = "1.18" or newer')
+        self.signing = Signing(signing_key)
+        """outlives a boot, as PX4's key does on its card"""
         self.parameters = ParameterTable({**(parameters or {}), "MAV_SYS_ID": system_id}, self.version)
-        self._origin_ned_m = _plus(home_ned_m, ekf_origin_offset_m)
-        start = _minus(NO_OFFSET, ekf_origin_offset_m)
+        self._origin_ned_m = plus(home_ned_m, ekf_origin_offset_m)
+        start = minus(NO_OFFSET, ekf_origin_offset_m)
         # The vehicle moves in the estimator's own frame; what is true in the fleet frame is that plus its origin.
         self.vehicle = Vehicle(start.north, start.east, start.down, dynamics, yaw_rad=yaw_rad)
         self._gust = OrnsteinUhlenbeck(
@@ -144,6 +152,7 @@ class Autopilot:
         self._catch_up(now_ns)
         if self.link.deaf:
             return
+        datagram = self.signing.admitted(datagram)
         if is_one_frame(datagram) and datagram[7:10] == SETPOINT_KEY and self.link.mav.buf_len() == 0:
             # What comes many times a second is read without pymavlink's objects; what is damaged goes the long way.
             values = unpacked(SETPOINT, datagram)
@@ -172,7 +181,7 @@ class Autopilot:
     def advance(self, now_ns: int) -> list[bytes]:
         """Moves on to `now_ns` and gives what is to be sent, one message a datagram."""
         self._catch_up(now_ns)
-        return self.link.take()
+        return [self.signing.sign(packet, COMPANION_LINK) for packet in self.link.take()]
 
     def skip(self, until_ns: int) -> None:
         """Moves on without the streams of the time between: a host that stalled sends nothing late, as PX4 does not."""
@@ -226,7 +235,7 @@ class Autopilot:
 
     def _move_origin(self, by_ned_m: Ned) -> None:
         """The estimator's origin moves in the fleet frame; nothing true changes."""
-        self._origin_ned_m = _plus(self._origin_ned_m, by_ned_m)
+        self._origin_ned_m = plus(self._origin_ned_m, by_ned_m)
         self.vehicle.shift(-by_ned_m.north, -by_ned_m.east, -by_ned_m.down)
         self.navigator.shift(-by_ned_m.north, -by_ned_m.east, -by_ned_m.down)
         self.telemetry.move_origin(ned_to_geodetic(self._origin_ned_m, self._fleet_origin), by_ned_m)
@@ -316,7 +325,7 @@ class Autopilot:
         unsent = self.link.take()
         self._boot_ns += self.now_ns
         here = Ned(self.vehicle.north_m, self.vehicle.east_m, self.vehicle.down_m)
-        self._move_origin(_plus(here, self._ekf_origin_offset_m))
+        self._move_origin(plus(here, self._ekf_origin_offset_m))
         self._boot()
         self.link.put_back(unsent)
 
@@ -336,6 +345,8 @@ class Autopilot:
                 services.synchronise(message)
             case "PING":
                 services.ping(message)
+            case "SETUP_SIGNING":
+                self._set_up_signing(message)
             case "SET_MODE":
                 if message.target_system == self.telemetry.system_id:
                     custom = message.custom_mode
@@ -362,6 +373,11 @@ class Autopilot:
             case "FILE_TRANSFER_PROTOCOL":
                 services.refuse_file_transfer(message)
 
+    def _set_up_signing(self, message: Any) -> None:
+        known = self.version.signing and self._addressed(message)
+        if known and (why := self.signing.set_up(message, self.commander.armed)):
+            self._reject(why)
+
     def _take_setpoint(self, message: Any) -> None:
         setpoint, reason = decode_setpoint(message, self.telemetry.yaw_rad)
         if setpoint is None:
@@ -383,11 +399,3 @@ class Autopilot:
                 message.command, int(result), 0, 0, message.get_srcSystem(), message.get_srcComponent()
             )
         )
-
-
-def _plus(a: Ned, b: Ned) -> Ned:
-    return Ned(a.north + b.north, a.east + b.east, a.down + b.down)
-
-
-def _minus(a: Ned, b: Ned) -> Ned:
-    return Ned(a.north - b.north, a.east - b.east, a.down - b.down)

@@ -12,7 +12,7 @@ from typing import Any
 from pymavlink.dialects.v20 import development as mavlink
 
 from companion.core.frames import Geodetic, ned_to_geodetic
-from sim.autopilot.autopilot import Autopilot
+from sim.autopilot.autopilot import GROUND_LINK, Autopilot
 from sim.autopilot.link import Link, StreamSchedule
 from sim.autopilot.streams import STREAMS
 from sim.autopilot.telemetry import quaternion
@@ -81,7 +81,7 @@ class GroundLink:
         if self._schedule.next_due_ns <= self._autopilot.now_ns:
             self._schedule.send_due(self._autopilot.now_ns)
         for datagram in self._out.take():
-            self._send(datagram, self._station)
+            self._send(self._autopilot.signing.sign(datagram, GROUND_LINK), self._station)
         message: Any = self._truth()
         self._send(message.pack(self._out.mav), self._viewer)
 

@@ -9,6 +9,7 @@ from companion.config.derived import Vehicle
 from companion.config.endpoints import autopilot_port, companion_port, udp_endpoint
 from companion.core.frames import Ned
 from companion.errors import ConfigError
+from companion.io.signing_key import read_key
 from companion.vehicle.autopilot.px4_versions import fleet_parameters, version_named
 from sim.autopilot.disturbances import GustParameters, NoiseParameters
 from sim.autopilot.dynamics_parameters import DynamicsParameters
@@ -25,6 +26,13 @@ def _ports(vehicle: Vehicle) -> tuple[int, int]:
 def stub_port(vehicle: Vehicle) -> int:
     """The UDP port that the vehicle's stub binds."""
     return _ports(vehicle)[0]
+
+
+def _signing_key(vehicle: Vehicle, folder: Path) -> bytes:
+    file = vehicle.signing_key_beside(folder / "fleet.toml")
+    if file is None:
+        raise ConfigError(f"vehicle {vehicle.id}: names no signing_key, and [stub] signing demands one")
+    return read_key(file)
 
 
 def check_stub_links(config: FleetConfig) -> None:
@@ -47,8 +55,12 @@ def stub_settings(
     stop_fd: int | None = None,
     grace_s: float = 0.0,
     ground: bool = False,
+    folder: Path = Path(),
 ) -> StubFleetSettings:
-    """Settings of the stubs; each estimator's origin lies elsewhere, by up to `stub.origin_scatter_m`, after `seed`."""
+    """Settings of the stubs; each estimator's origin lies elsewhere, by up to `stub.origin_scatter_m`, after `seed`.
+
+    `folder`: of the fleet's file, beside which keys lie.
+    """
     stub = config.stub
     random = Random(f"origins/{seed}")
     parameters = tuple(fleet_parameters(version_named(stub.px4)).items())
@@ -72,6 +84,7 @@ def stub_settings(
                 booted_before_ns=round(k / len(config.vehicles) * 1e9 / config.limits.control_rate_hz),
                 parameters=parameters,
                 px4=stub.px4,
+                signing_key=_signing_key(v, folder) if stub.signing else None,
             )
         )  # fmt: skip
     return StubFleetSettings(

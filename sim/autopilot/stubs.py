@@ -84,7 +84,9 @@ class StubVehicleSettings:
     parameters: tuple[tuple[str, float | int], ...] = ()
     """PX4 parameters that differ from the default"""
     px4: str = OLDEST.name
-    """whose parameters it has"""
+    """which version it plays"""
+    signing_key: bytes | None = None
+    """by which it demands signed MAVLink"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,6 +233,7 @@ def build_autopilot(
         noise=settings.noise,
         parameters=dict(vehicle.parameters),
         px4=vehicle.px4,
+        signing_key=vehicle.signing_key,
         yaw_rad=vehicle.yaw_rad,
         seed=settings.seed,
     )
@@ -287,6 +290,9 @@ def run_stubs(settings: StubFleetSettings) -> None:
             _serve(settings, links, selector, recorder, boot_ns, utc_offset_ns)
     finally:
         for link in links:
+            if refused := link.autopilot.signing.rejected:
+                told = ", ".join(f"{count} {why}" for why, count in sorted(refused.items()))
+                print(f"vehicle {link.settings.vehicle_id}: frames not believed: {told}", flush=True)  # noqa: T201
             link.socket.close()
             if link.ground is not None:
                 link.ground.socket.close()

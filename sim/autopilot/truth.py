@@ -24,3 +24,13 @@ class TruthState(NamedTuple):
     """valid offboard set-points since boot"""
     setpoint_last_ns: int | None
     """host's monotonic time of the last one"""
+
+
+def plus(a: Ned, b: Ned) -> Ned:
+    """Sum of two vectors of one frame."""
+    return Ned(a.north + b.north, a.east + b.east, a.down + b.down)
+
+
+def minus(a: Ned, b: Ned) -> Ned:
+    """Difference of two vectors of one frame."""
+    return Ned(a.north - b.north, a.east - b.east, a.down - b.down)

@@ -84,7 +84,13 @@ class StubsJob:
         truth = None if self.truth is None else Path(self.truth)
         run_stubs(
             stub_settings(
-                config, seed=self.seed, truth_path=truth, stop_fd=LIFELINE, grace_s=STUBS_GRACE_S, ground=self.ground
+                config,
+                seed=self.seed,
+                truth_path=truth,
+                stop_fd=LIFELINE,
+                grace_s=STUBS_GRACE_S,
+                ground=self.ground,
+                folder=Path(self.fleet).parent,
             )
         )
         return 0

@@ -20,6 +20,7 @@ from companion.config import FleetConfig
 from companion.config.file import parse
 from companion.errors import CompanionError, RefusedError
 from companion.io.network import operator_link
+from companion.io.signing_key import make_key
 from companion.operator.client import Operator
 from sim.autopilot.faults import FaultKind
 from sim.autopilot.stubs import TRUTH_DTYPE
@@ -160,8 +161,19 @@ class _Launch:
 
     def _write_configuration(self, tables: dict[str, Any]) -> FleetConfig:
         config = parse(tables, "fleet.toml")
+        if config.stub.signing and self.options.px4 is None and not self.options.external:
+            self._make_keys(tables, config)
+            config = parse(tables, "fleet.toml")
         _write(self._file, tomli_w.dumps(_without_none(tables)))
         return config
+
+    def _make_keys(self, tables: dict[str, Any], config: FleetConfig) -> None:
+        """In the flight's folder, for the vehicles that name none."""
+        for v in config.vehicles:
+            row = next(row for row in tables["vehicle"] if row["id"] == v.id)
+            if row.get("signing_key") is None:
+                row["signing_key"] = f"vehicle-{v.id}.key"
+                make_key(self.options.folder / row["signing_key"])
 
     def _start_autopilots(self) -> None:
         options, file = self.options, str(self._file)

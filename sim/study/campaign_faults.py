@@ -46,12 +46,13 @@ EXPLAINED: dict[str, frozenset[Failsafe]] = {
         "gps_wrong": _NO_POSITION | {_F.POSITION_JUMPS, _F.COVARIANCE},
         "link_lost": _NO_POSITION | {_F.HEARTBEAT, _F.PILOT},
         "wind": set(),
+        "battery_empty": {_F.BATTERY_LOW, _F.BATTERY_CRITICAL, _F.NOT_ARMED, _F.AUTOPILOT},
         "px4_restarted": _NO_POSITION | {_F.HEARTBEAT, _F.PILOT},
     }.items()
 }
 """fault -> the failsafes of the same vehicle that it explains, from when it comes on. Who falls strikes the ground; who
 hovers where its frozen position is not believes that a pilot ended its climb."""
-ON_PX4_ALONE = frozenset({"gps_stuck", "gps_wrong", "link_lost", "wind", "px4_restarted"})
+ON_PX4_ALONE = frozenset({"gps_stuck", "gps_wrong", "link_lost", "wind", "px4_restarted", "battery_empty"})
 """not drawn in lockstep"""
 NETWORK_KINDS = frozenset({"partition"})
 """of the network as a whole, and of no vehicle"""

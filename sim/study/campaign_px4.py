@@ -61,7 +61,7 @@ RAISED = re.compile(r"[a-z ]+: \w*(Error|Exception|Warning|Interrupt)")
 """what a companion's guard counts"""
 AUTOPILOT_KINDS = {
     "gps_lost": FaultKind.GPS_LOST, "gps_stuck": FaultKind.GPS_STUCK, "gps_wrong": FaultKind.GPS_WRONG,
-    "low_battery": FaultKind.LOW_BATTERY, "wind": FaultKind.WIND, "link_lost": FaultKind.LINK_LOST,
+    "battery_empty": FaultKind.LOW_BATTERY, "wind": FaultKind.WIND, "link_lost": FaultKind.LINK_LOST,
     "pilot_takeover": FaultKind.PILOT_TAKEOVER, "px4_restarted": FaultKind.REBOOT,
 }  # fmt: skip
 COMPANION_KINDS = {

@@ -52,6 +52,7 @@ class Flight:
         seed: int = 1,
         quiet: bool = True,
         px4: str = OLDEST.name,
+        signing_key: bytes | None = None,
     ) -> None:
         self.boot_s = boot_s
         self.now_ns = round(boot_s * SECOND_NS)
@@ -67,6 +68,7 @@ class Flight:
             noise=noise,
             parameters=parameters,
             px4=px4,
+            signing_key=signing_key,
             seed=seed,
         )
         self.received: list[tuple[float, Any]] = []

@@ -457,12 +457,14 @@ def test_whatever_else_is_sent_is_to_the_byte_what_pymavlink_packs(
 
 def test_every_layout_is_the_one_in_pymavlinks_dialect() -> None:
     layouts = [value for value in vars(wire).values() if isinstance(value, Layout)]
-    assert {layout.message_id for layout in layouts} == {*ALL_READ, 20, 76, 84}
+    assert {layout.message_id for layout in layouts} == {*ALL_READ, 20, 76, 84, 256}
     for layout in layouts:
         kind = dialect.mavlink_map[layout.message_id]
         assert layout.extra == bytes((kind.crc_extra,))
         # A parameter's value is looked at as bytes; what nobody reads at a message's end is left out.
-        assert kind.unpacker.format.startswith(layout.fields.format.replace("4s", "f").replace("8s", "8B"))
+        assert kind.unpacker.format.startswith(
+            layout.fields.format.replace("4s", "f").replace("8s", "8B").replace("32s", "32B")
+        )
 
 
 @pytest.mark.parametrize(("told", "means"), [(0, 0), (55, 55), (100, 100), (-1, -1), (-5, -1), (101, -1), (127, -1)])
