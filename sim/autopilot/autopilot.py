@@ -15,6 +15,7 @@ from pymavlink.dialects.v20 import development as mavlink
 from companion.core.frames import Geodetic, Ned, ned_to_geodetic
 from companion.vehicle.autopilot.px4_versions import OLDEST, version_named
 from companion.wire.mavlink_frames import is_one_frame
+from companion.wire.signing import ticks_at
 from sim.autopilot.commander import HOME_SET_NS, Commander, Result
 from sim.autopilot.commands import CommandRequest, answer, set_mode
 from sim.autopilot.disturbances import GustParameters, NoiseParameters, OrnsteinUhlenbeck, normals
@@ -94,8 +95,8 @@ class Autopilot:
         self.version = version_named(px4)
         if signing_key is not None and not self.version.signing:
             raise ValueError(f'PX4 {px4} signs nothing: [stub] signing needs px4 = "1.18" or newer')
-        self.signing = Signing(signing_key)
-        """outlives a boot, as PX4's key does on its card"""
+        # The key outlives a boot, as PX4's does on its card; it was given at the start.
+        self.signing = Signing(signing_key, ticks_at(boot_ns + utc_offset_ns))
         self.parameters = ParameterTable({**(parameters or {}), "MAV_SYS_ID": system_id}, self.version)
         self._origin_ned_m = plus(home_ned_m, ekf_origin_offset_m)
         start = minus(NO_OFFSET, ekf_origin_offset_m)
@@ -150,9 +151,7 @@ class Autopilot:
     def receive(self, datagram: bytes, now_ns: int) -> None:
         """Takes what arrived from the link at `now_ns`; answers wait for the next `advance`."""
         self._catch_up(now_ns)
-        if self.link.deaf:
-            return
-        datagram = self.signing.admitted(datagram)
+        datagram = b"" if self.link.deaf else self.signing.admitted(datagram)
         if is_one_frame(datagram) and datagram[7:10] == SETPOINT_KEY and self.link.mav.buf_len() == 0:
             # What comes many times a second is read without pymavlink's objects; what is damaged goes the long way.
             values = unpacked(SETPOINT, datagram)

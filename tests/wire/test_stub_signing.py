@@ -3,14 +3,14 @@
 from typing import Any
 
 import pytest
-from autopilot_flight import Flight, mavlink
+from autopilot_flight import UTC_OFFSET_NS, Flight, mavlink
 
 from companion.wire.mavlink import COMMAND_LONG, SET_POSITION_TARGET_LOCAL_NED
 from companion.wire.signing import Refused, signed, ticks_at
 from sim.autopilot.modes import Mode
 
 KEY, NEW = bytes(range(1, 33)), bytes(range(2, 34))
-NOW = ticks_at(1_790_000_000_000_000_000)
+NOW = ticks_at(UTC_OFFSET_NS)
 ARM = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 400, 1, 1, 0)
 
 
@@ -63,6 +63,7 @@ def test_a_signed_companion_flies_it_from_take_off_to_offboard() -> None:
         (arm(NEW, NOW + 10**9), Refused.WRONG_SIGNATURE),
         (arm(KEY, NOW), Refused.REPLAYED),
     ],
+    ids=["unsigned", "wrong key", "wrong key, from the future", "replayed"],
 )
 def test_what_an_impostor_sends_is_not_obeyed_and_counted_and_the_owner_is_heard_on(
     datagram: bytes, why: Refused
