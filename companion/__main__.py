@@ -123,6 +123,19 @@ def signing_give(
     tell(give_key(config, one, key_file, old))
 
 
+@app.command("px4-params")
+def px4_params(
+    px4: Annotated[str, typer.Option(help="PX4's version: 1.16, 1.17, 1.18 or main.")],
+    fleet: Annotated[Path, typer.Option(help="The fleet's configuration.")] = Path("fleet.toml"),
+) -> None:
+    """Print the PX4 parameters that this fleet wants of each vehicle, as a file that QGroundControl loads."""
+    from companion.config import load
+    from companion.vehicle.autopilot.px4_params_file import params_file
+    from companion.vehicle.autopilot.px4_versions import version_named
+
+    typer.echo("\n".join(params_file(load(fleet), version_named(px4))))
+
+
 @app.command()
 def replay(
     file: Annotated[Path, typer.Argument(help="A companion's recording (MCAP).")],

@@ -55,8 +55,10 @@ FIRST_INSTANCE, INSTANCES_APART = 40, 10
 """beside whatever else flies on this machine"""
 SLOTS = 8
 """flights at a time, each with instance numbers of its own"""
-TRIES = 2
-"""a flight that does not come up, on a machine that stalled, is tried again, and counted"""
+TRIES = 3
+"""a flight that does not come up, or in which the machine stalled, is flown again, and counted; the last one counts"""
+MACHINE_LATE_MOST_S = 0.25
+"""an empty 50 Hz loop that was so late shows a machine that flew nobody in real time: PX4 waits 1 s for setpoints"""
 RAISED = re.compile(r"[a-z ]+: \w*(Error|Exception|Warning|Interrupt)")
 """what a companion's guard counts"""
 AUTOPILOT_KINDS = {
@@ -242,6 +244,7 @@ def _record(
         "left_in_hold": [i for i, on_ground in summary["landed"].items() if not on_ground],
         "ended_after_s": float(seen.seconds[-1]),
         "faults_refused": summary["faults_refused"],
+        "machine_late_s": (summary["reference_lateness_ms"]["max"] or 0.0) * 1e-3,
     }
 
 
@@ -250,12 +253,15 @@ def piece(config: Config, seed: int) -> Record:
     build = build_of(config)
     flight = flight_of(config, build)
     with _slot() as slot:
-        for attempt in range(TRIES):
+        for attempt in range(1, TRIES + 1):
             try:
-                return {**fly_px4(flight, seed, build, slot), "tries": attempt + 1}
+                record = fly_px4(flight, seed, build, slot)
             except CompanionError as error:
-                if attempt + 1 == TRIES:
+                if attempt == TRIES:
                     raise CompanionError(f"seed {seed} does not come up, tried {TRIES} times: {error}") from error
+                continue
+            if record["machine_late_s"] <= MACHINE_LATE_MOST_S or attempt == TRIES:
+                return {**record, "tries": attempt}
     raise AssertionError
 
 
@@ -282,8 +288,12 @@ def finish(config: Config, pieces: Sequence[Record], seeds: Sequence[int]) -> Ou
     how = f"Real companions on real PX4 in SITL (like {build_version(build_of(config)).name})"
     outcome = tables_of(flight_of(config, build_of(config)), how, pieces, seeds)
     again = sum(p["tries"] > 1 for p in pieces)
+    late = sum(p["machine_late_s"] > MACHINE_LATE_MOST_S for p in pieces)
     refused = sum(len(p["faults_refused"]) for p in pieces)
-    outcome.findings.append(f"{again} flights came up at the second try; {refused} faults were not carried out.")
+    outcome.findings.append(
+        f"{again} flights were flown again, since the machine had stalled or PX4 had not come up; in {late} it stalled "
+        f"the last time too. {refused} faults were not carried out."
+    )
     return outcome
 
 
