@@ -125,15 +125,21 @@ def signing_give(
 
 @app.command("px4-params")
 def px4_params(
+    file: Annotated[Path, typer.Argument(help="The file to write, as px4.params.")],
     px4: Annotated[str, typer.Option(help="PX4's version: 1.16, 1.17, 1.18 or main.")],
     fleet: Annotated[Path, typer.Option(help="The fleet's configuration.")] = Path("fleet.toml"),
 ) -> None:
-    """Print the PX4 parameters that this fleet wants of each vehicle, as a file that QGroundControl loads."""
+    """Write the PX4 parameters that this fleet wants of each vehicle, as a file that QGroundControl loads."""
     from companion.config import load
     from companion.vehicle.autopilot.px4_params_file import params_file
     from companion.vehicle.autopilot.px4_versions import version_named
 
-    typer.echo("\n".join(params_file(load(fleet), version_named(px4))))
+    lines = list(params_file(load(fleet), version_named(px4)))
+    try:
+        file.write_text("\n".join((*lines, "")), encoding="utf-8")
+    except OSError as error:
+        raise CompanionError(f"cannot write {file}: {error.strerror}") from error
+    tell(f"{file}: {sum(not line.startswith('#') for line in lines)} parameters for PX4 {px4}, with reasons")
 
 
 @app.command()

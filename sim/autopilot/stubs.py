@@ -24,6 +24,7 @@ import numpy as np
 
 from companion.core.frames import Geodetic, Ned
 from companion.errors import CompanionError
+from companion.terminal import tell
 from companion.vehicle.autopilot.px4_versions import OLDEST
 from sim.autopilot.autopilot import NO_OFFSET, Autopilot
 from sim.autopilot.disturbances import GustParameters, NoiseParameters
@@ -292,7 +293,7 @@ def run_stubs(settings: StubFleetSettings) -> None:
         for link in links:
             if refused := link.autopilot.signing.rejected:
                 told = ", ".join(f"{count} {why}" for why, count in sorted(refused.items()))
-                print(f"vehicle {link.settings.vehicle_id}: frames not believed: {told}", flush=True)  # noqa: T201
+                tell(f"vehicle {link.settings.vehicle_id}: frames not believed: {told}")
             link.socket.close()
             if link.ground is not None:
                 link.ground.socket.close()

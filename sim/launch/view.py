@@ -82,6 +82,10 @@ def show_summary(summary: Mapping[str, Any]) -> None:
     rows = [
         ("vehicles", summary["vehicles"]),
         ("formed after", _unit(summary["formed_after_s"], "s")),
+        (
+            "its shape, its place after",
+            f"{_unit(summary['shape_formed_after_s'], 's')}, {_unit(summary['place_taken_after_s'], 's')}",
+        ),
         ("minimum distance", _unit(summary["minimum_distance_m"], "m")),
         ("formation error, rms", _unit(steady["formation_error_rms_m"], f"m over {steady['seconds']} s")),
         ("the same, estimates' errors unlike", _unit(summary["estimates"]["formation_error_decorrelated_rms_m"], "m")),

@@ -152,6 +152,23 @@ def test_the_summary_says_what_the_true_states_say(ten: Recorded) -> None:
     json.dumps(summary, allow_nan=False)
 
 
+def test_shape_and_place_are_told_apart(ten: Recorded) -> None:
+    """The same flight with all of it carried off by a metre: its shape stands as before, its place is nobody's."""
+    ls = ten.ls
+    told = []
+    for off_m in (0.0, 1.0):
+        rows = ls.truth()
+        rows["position_ned_m"][:, 0] += off_m
+        flight = Flight(ten.config, 3, rows, round(READY_S * 1e9) + UTC_AT_START_NS)
+        flight.events = ls.events
+        told.append(summarise(flight))
+    here, carried_off = told
+    assert 0.0 < here["place_taken_after_s"] <= here["formed_after_s"] + 1.0
+    assert 0.0 < here["shape_formed_after_s"] <= here["formed_after_s"] + 1.0
+    assert carried_off["shape_formed_after_s"] == here["shape_formed_after_s"]
+    assert carried_off["place_taken_after_s"] is None
+
+
 def test_replaying_a_vehicles_recorded_inputs_gives_the_recorded_outputs_byte_for_byte(ten: Recorded) -> None:
     agent = Agent(TEN, REPLAYED, ten.ls.vehicles[REPLAYED].agent.boot_id)
     result = replay(agent, iter(ten.tape.entries[REPLAYED]))

@@ -196,7 +196,8 @@ def test_the_summary_shows_no_control_characters(text: str) -> None:
     none = {"p50": None, "p99": None}
     summary: dict[str, Any] = dict.fromkeys(
         (
-            "vehicles", "formed_after_s", "minimum_distance_m", "cpu_per_tick_ms", "setpoint_gap_max_s",
+            "vehicles", "formed_after_s", "shape_formed_after_s", "place_taken_after_s",
+            "minimum_distance_m", "cpu_per_tick_ms", "setpoint_gap_max_s",
             "touchdown_max_m_s",
         ),
         text,

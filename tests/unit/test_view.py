@@ -124,7 +124,8 @@ def test_the_summary_shows_who_commanded_what_and_who_was_killed(capsys: pytest.
     )  # fmt: skip
     show_summary(
         {
-            "vehicles": 3, "formed_after_s": 20.0, "minimum_distance_m": 3.0, "steady": steady,
+            "vehicles": 3, "formed_after_s": 20.0, "shape_formed_after_s": 19.0, "place_taken_after_s": 19.5,
+            "minimum_distance_m": 3.0, "steady": steady,
             "estimates": estimates, "latency_ms": none,
             "loop_lateness_ms": none, "reference_lateness_ms": none, "cpu_per_tick_ms": None,
             "setpoint_gap_max_s": 0.1, "touchdown_max_m_s": 12.6, "killed": {3: "killed by command"}, "failsafes": [],

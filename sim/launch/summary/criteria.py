@@ -7,6 +7,8 @@ from companion.config import FleetConfig
 
 TOUCHDOWN_MAX_M_S = 2.0
 """nobody comes down faster than this just above the ground: PX4 lands at 0.7 m/s, and a fall from 0.2 m ends at this"""
+SHAPE_SHARE = 0.075
+"""of the spacing: how far the formation may be from its shape"""
 SETPOINT_GAP_MAX_S = 0.5
 """half of the COM_OF_LOSS_T of 1.0 s after which the autopilot's failsafe acts"""
 
@@ -19,7 +21,7 @@ def criteria(summary: Mapping[str, Any], config: FleetConfig, centroid_limit_m: 
     spacing = config.formation.spacing_m
     rows: list[tuple[str, Any, str, float]] = [
         *([(distance, nearest, ">=", 0.3 * spacing)] if len(config.vehicles) > 1 else []),
-        (f"{source}.formation_error_rms_m", summary[source]["formation_error_rms_m"], "<=", 0.075 * spacing),
+        (f"{source}.formation_error_rms_m", summary[source]["formation_error_rms_m"], "<=", SHAPE_SHARE * spacing),
         *(
             [(f"{source}.centroid_error_rms_m", summary[source]["centroid_error_rms_m"], "<=", centroid_limit_m)]
             if config.plan.kind == "legs"

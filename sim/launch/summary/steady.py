@@ -13,12 +13,14 @@ from companion.core.trajectory.fleet import FleetTrajectory
 from companion.core.trajectory.history import TrajectoryHistory
 from companion.core.values import Phase
 from sim.launch.summary.flight import Array, Flight
-from sim.launch.summary.numbers import rounded
+from sim.launch.summary.numbers import rounded, step_s
 from sim.measures import algebraic_connectivity, centroid_error_m, formation_error_m, velocity_error_m_s
 
 SETTLING_S = 3.0
 """left out of the steady part after forming and after a change of formation"""
 WINDOW_S = 10.0
+HELD_S, SAMPLED_S = 2.0, 0.1
+"""shape and place count once they have held for HELD_S; looked at so often"""
 LEFT_FORMATION = frozenset({Phase.IDLE, Phase.RETURNING, Phase.LANDING, Phase.LANDED, Phase.RELEASED})
 """phases with which the steady part ends"""
 
@@ -30,6 +32,40 @@ def formed_ns(flight: Flight, staying: Sequence[int]) -> int | None:
         if isinstance(event, PhaseChanged) and event.after is Phase.FORMED:
             first[i] = min(time_ns, first.get(i, time_ns))
     return max(first[i] for i in staying) if staying and all(i in first for i in staying) else None
+
+
+def formed_apart(
+    flight: Flight, history: TrajectoryHistory, ids: Sequence[int], times: Array, position: Array,
+    limits: tuple[float, float],
+) -> dict[str, float | None]:  # fmt: skip
+    """When the formation had its shape, and when it was at its place (s after the take-off command), each for HELD_S.
+
+    `position` over (time, vehicle, axis), of times at which all fly by setpoints; `limits`: of the formation's error
+    about its centroid and of the centroid's own (m). A wind may carry off a formation whose shape stands. None: never.
+    """
+    begin = history.motions[1].blend_end_ns if len(history.motions) > 1 else None
+    found: dict[str, float | None] = {"shape_formed_after_s": None, "place_taken_after_s": None}
+    if begin is None or len(times) < 2:
+        return found
+    step = max(round(SAMPLED_S / max(step_s(times), 1e-3)), 1)
+    sampled = [k for k in range(0, len(times), step) if times[k] >= begin]
+    errors = []
+    for k in sampled:
+        motion = history.at(int(times[k]))
+        if motion.free_at(int(times[k])):
+            return found
+        state = motion.state_at(int(times[k]))
+        slots = np.array([state.slot(motion.slots[i]).position_ned_m for i in ids])
+        shape_m = float(np.sqrt(np.square(formation_error_m(position[k], slots)).mean()))
+        errors.append((shape_m, centroid_error_m(position[k], slots)))
+    for (name, which), limit in zip((("shape_formed_after_s", 0), ("place_taken_after_s", 1)), limits, strict=True):
+        since: int | None = None
+        for k, error in zip(sampled, errors, strict=True):
+            since = None if not error[which] <= limit else k if since is None else since
+            if since is not None and (times[k] - times[since]) * 1e-9 >= HELD_S:
+                found[name] = rounded((int(times[since]) - flight.takeoff_ns) * 1e-9)
+                break
+    return found
 
 
 def steady_at(flight: Flight, history: TrajectoryHistory, times: Array, formed: int | None) -> npt.NDArray[np.bool_]:

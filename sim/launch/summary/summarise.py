@@ -12,11 +12,11 @@ from companion.core.events import FailsafeActed, Killed
 from companion.wire.px4 import Px4Mode
 from sim.launch.summary.believed import STEP_NS, believed_errors, estimate_errors, times_of
 from sim.launch.summary.believed import minimum_distance_m as believed_minimum_m
-from sim.launch.summary.criteria import criteria
+from sim.launch.summary.criteria import SHAPE_SHARE, criteria
 from sim.launch.summary.flight import TICK_ROWS, Command, Flight
 from sim.launch.summary.loops import cpu_per_tick_ms, sent_gap_max_s, sent_per_vehicle_s
 from sim.launch.summary.numbers import per_vehicle, percentiles, rms, rounded, step_s
-from sim.launch.summary.steady import errors_from_slots, formed_ns, steady_at
+from sim.launch.summary.steady import errors_from_slots, formed_apart, formed_ns, steady_at
 from sim.launch.summary.truth import attitude_rate_deg_s, minimum_distance, truth_of
 
 COMMANDS_TOLD_MOST = 1000
@@ -37,15 +37,17 @@ def summarise(flight: Flight) -> dict[str, Any]:
     known = len(times) > 0
     if known:
         follows = truth.flies & (truth.mode == Px4Mode.OFFBOARD)
-        steady = steady_at(flight, history, times, formed) & follows[:, columns].all(axis=1)
+        flown = follows[:, columns].all(axis=1)
+        steady = steady_at(flight, history, times, formed) & flown
         seconds = float(steady.sum()) * step_s(times)
         window = (int(times[steady][0]), int(times[steady][-1])) if steady.any() else (0, 0)
     else:
         grid = times_of(flight, ids)
         inside = grid[steady_at(flight, history, grid, formed)]
-        steady = np.zeros(0, bool)
+        steady = flown = np.zeros(0, bool)
         seconds = len(inside) * STEP_NS * 1e-9
         window = (int(inside[0]), int(inside[-1])) if len(inside) else (0, 0)
+    limits = (SHAPE_SHARE * config.formation.spacing_m, flight.centroid_limit_m)
     figures = errors_from_slots(
         config, history, staying, times[steady], truth.position_ned_m[steady][:, columns],
         truth.velocity_ned_m_s[steady][:, columns],
@@ -66,6 +68,7 @@ def summarise(flight: Flight) -> dict[str, Any]:
         "vehicles": len(ids),
         "judged_by": "truth" if known else "the vehicles' own estimates",
         "formed_after_s": None if formed is None else rounded((formed - flight.takeoff_ns) * 1e-9),
+        **formed_apart(flight, history, staying, times[flown], truth.position_ned_m[flown][:, columns], limits),
         "minimum_distance_m": minimum,
         "minimum_distance_at_s": minimum_at_s,
         "steady": {
