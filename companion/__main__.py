@@ -1,8 +1,6 @@
 """Command `companion`: one vehicle's companion process."""
 
-import json
 import sys
-from dataclasses import asdict
 from pathlib import Path
 from time import process_time
 from typing import Annotated
@@ -69,24 +67,12 @@ def check(
     """
     from companion.config import load
     from companion.io.check import hardware_checks
-    from companion.wire.operator import unmet, warnings
+    from companion.operator.rows import show_rows
 
     config = load(fleet)
-    rows = []
     one = config.by_id(vehicle)
-    for row in hardware_checks(config, one, seconds, folder, signing_key or one.signing_key_beside(fleet)):
-        rows.append(row)
-        if not as_json:
-            value = "-" if row.value is None else row.value
-            met = ("see" if row.warns else "ok") if row.passed else "FAULT"
-            tell(f"{met:5}  {row.name:20}  {value!s:>20}  {row.limit}")
-    faults = unmet(rows)
-    if as_json:
-        typer.echo(json.dumps({"fit": not faults, "checks": [asdict(r) for r in rows]}))
-    else:
-        for row in (*warnings(rows), *faults):
-            tell(row.message)
-    raise typer.Exit(DIFFERENT if faults else 0)
+    rows = hardware_checks(config, one, seconds, folder, signing_key or one.signing_key_beside(fleet))
+    raise typer.Exit(0 if show_rows(rows, as_json) else DIFFERENT)
 
 
 @signing_app.command("make")

@@ -212,6 +212,23 @@ def fault(
     tell(f"vehicle {vehicle}: {kind}")
 
 
+@app.command()
+def doctor(
+    fleet: FleetFile = FLEET_TOML,
+    vehicles: Vehicles = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Every row as JSON.")] = False,
+) -> None:
+    """Look this machine over before a fleet flies on it: Python, libraries, ports, multicast, clock, PX4.
+
+    Exit status: 0 all met, 1 a row is not met, 2 wrong usage or configuration.
+    """
+    from companion.config.overrides import fleet_config
+    from companion.operator.rows import show_rows
+    from sim.launch.doctor import doctor_checks
+
+    raise typer.Exit(0 if show_rows(doctor_checks(fleet_config(fleet, vehicles)), as_json) else FAILED)
+
+
 @app.command(hidden=True)
 def sitl(
     px4: Annotated[Path, typer.Option()],
