@@ -154,6 +154,8 @@ class _Launch:
                 if not answers.all_accepted:
                     gone = (self.processes.why_ended(f"companion-{i}", "at take-off") for i in watch.ended())
                     raise RefusedError("\n".join((answers.sentence("take-off"), *gone)))
+                for note in answers.notes:
+                    self.tell(note)
                 lost = watch.fly(self.options.duration_s, self.options.faults, self.interrupted)
                 autopilots_lost = {i: how for i, how in watch.autopilots_ended().items() if i in ids}
             self._end(ids)

@@ -39,6 +39,10 @@ def how_it_ended(status: int) -> str:
 class Child(Protocol):
     """What the launcher needs of a process: `subprocess.Popen` and `Forked` have it."""
 
+    @property
+    def pid(self) -> int:
+        """Its number."""
+
     def poll(self) -> int | None:
         """Its exit status once it has ended; negative: the signal that ended it."""
 
@@ -165,9 +169,14 @@ class FleetProcesses:
 
     def stop(self, name: str, seconds: float) -> None:
         """Have a child stand still for a while."""
-        child = self.children[name]
-        child.send_signal(signal.SIGSTOP)
-        timer = threading.Timer(seconds, child.send_signal, (signal.SIGCONT,))
+        pid = self.children[name].pid
+
+        def go_on() -> None:
+            with suppress(ProcessLookupError):  # it has ended meanwhile
+                os.kill(pid, signal.SIGCONT)
+
+        self.children[name].send_signal(signal.SIGSTOP)
+        timer = threading.Timer(seconds, go_on)
         timer.daemon = True
         timer.start()
 

@@ -6,7 +6,9 @@ import pytest
 from autopilot_flight import ORIGIN, Flight, mavlink
 
 from companion.core.frames import Geodetic, Ned, geodetic_to_ned
-from sim.autopilot.faults import Fault, FaultKind, decode_order, encode_order
+from companion.vehicle.autopilot.px4_versions import VERSIONS, Px4Version
+from sim.autopilot.dynamics_parameters import DynamicsParameters
+from sim.autopilot.faults import OF_PX4_ALONE, Fault, FaultKind, decode_order, encode_order
 from sim.autopilot.modes import Mode
 
 
@@ -200,6 +202,53 @@ def test_slow_link_delivers_late_and_drops_the_rest() -> None:
     flight.run(2.0)
     recovered = [t - m.time_boot_ms / 1e3 for t, m in flight.received[-50:] if m.get_type() == "ATTITUDE"]
     assert max(recovered) < 0.02
+
+
+def test_a_wind_pushes_while_it_lasts_and_a_boot_ends_it() -> None:
+    flight = Flight(dynamics=DynamicsParameters(drag_per_s=1.0))
+    flight.take_off()
+    flight.go_offboard()
+    flight.autopilot.inject(Fault(FaultKind.WIND, duration_s=3.0, wind_ned_m_s=Ned(0.0, 4.0, 0.0)))
+    before = flight.position.east
+    flight.stream(flight.setpoint(), 1.0)
+    assert flight.velocity.east > 0.2
+    assert flight.position.east > before
+    flight.stream(flight.setpoint(), 20.0)
+    assert abs(flight.velocity.east) < 0.1, "over, and the loops have it again"
+    assert flight.autopilot.vehicle.parameters.wind_east_m_s == 0.0
+    flight.autopilot.inject(Fault(FaultKind.WIND, wind_ned_m_s=Ned(0.0, 4.0, 0.0)))
+    assert flight.autopilot.vehicle.parameters.wind_east_m_s == 4.0
+    flight.autopilot.reboot()
+    assert flight.autopilot.vehicle.parameters.wind_east_m_s == 0.0
+
+
+def test_a_lost_link_carries_nothing_either_way_and_comes_back() -> None:
+    flight = flying()
+    assert flight.mode is Mode.OFFBOARD
+    flight.autopilot.inject(Fault(FaultKind.LINK_LOST, duration_s=2.0))
+    heard = len(flight.received)
+    flight.stream(flight.setpoint(), 1.9)
+    assert len(flight.received) == heard
+    flight.stream(flight.setpoint(), 1.5)
+    assert len(flight.received) > heard
+    assert flight.last("CURRENT_MODE").intended_custom_mode == Mode.OFFBOARD.custom_mode
+
+
+@pytest.mark.parametrize("kind", sorted(OF_PX4_ALONE))
+def test_what_a_stub_does_not_play_it_refuses_with_who_does(kind: FaultKind) -> None:
+    with pytest.raises(ValueError, match=f"{kind} is for --autopilot px4"):
+        Flight().autopilot.inject(Fault(kind))
+
+
+@pytest.mark.parametrize("version", VERSIONS, ids=lambda v: v.name)
+def test_without_a_position_it_comes_down_in_the_mode_that_its_version_has_for_that(version: Px4Version) -> None:
+    flight = Flight(px4=version.name)
+    flight.take_off()
+    flight.autopilot.inject(Fault(FaultKind.GPS_LOST))
+    flight.run(8.0)
+    assert flight.mode is (Mode.DESCEND if version.descend_mode else Mode.LAND)
+    flight.run_while(lambda: flight.armed, 40.0)
+    assert flight.set_mode(Mode.DESCEND) == 1, "nobody can choose it"
 
 
 def test_fault_of_no_duration_ends_one_that_lasts() -> None:
