@@ -17,6 +17,7 @@ def test_rows_follow_values_and_names_that_change_in_place() -> None:
     values: dict[str, float | int] = {}
     missing: set[str] = set()
     identity = Px4Identity()
+    identity.take(Software(1, 18, 0, 255, ""))
     assert [r.name for r in rows.of(values, missing, identity)] == ["PX4 version", "parameters"]
     assert {r.vehicle for r in rows.of(values, missing, identity)} == {3}
     values["COM_OF_LOSS_T"] = 1.0

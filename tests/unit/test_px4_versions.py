@@ -115,7 +115,7 @@ def test_a_newer_one_is_flown_with_a_warning_that_names_what_was_verified() -> N
 @pytest.mark.parametrize(
     ("told", "there", "says"),
     [
-        (None, NEW, "the autopilot does not tell its PX4 version: it is taken for v1.19, "),
+        (None, NEW, "PX4 does not tell its version: it is taken for v1.19, "),
         (software(0, 0, 0, 0), OLD, "PX4 tells v0.0.0-dev, as a build without tags does: it is taken for v1.17, "),
         (software(1, 16), NEW, "PX4 tells v1.16.0 and has MAN_OVERRIDE_SPD, as v1.18 and newer have: "),
         (software(1, 19), OLD, "PX4 tells v1.19.0 and has COM_RC_OVERRIDE, as v1.17 and older have: "),
@@ -127,6 +127,15 @@ def test_what_contradicts_itself_or_is_silent_is_flown_with_a_word(
     passed, warns, said = identified(told, there)
     assert (passed, warns) == (True, True)
     assert said.startswith(says)
+
+
+def test_nobody_takes_off_before_it_has_told_or_was_asked_in_vain() -> None:
+    identity = Px4Identity()
+    assert identity.check({NEW}).message == "PX4's version is not told yet"
+    assert not identity.check({NEW}).passed
+    assert not identity.check({NEW}).permanent
+    identity.take(software(1, 18))
+    assert identity.check({NEW}).passed
 
 
 def test_it_is_asked_once_a_second_until_it_tells_and_no_more_than_so_often() -> None:

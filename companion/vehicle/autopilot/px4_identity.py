@@ -59,8 +59,9 @@ class Px4Identity:
         """Its version as a row of preflight: too old is a fault, what nobody has flown is worth a word."""
         told, row = self.told, self.row(there)
         if told is None:
-            says = f"the autopilot does not tell its PX4 version: {_taken(row)}"
-            return Check(ROW, None, LIMIT, True, says if self.silent else "", warns=self.silent)
+            if not self.silent:
+                return Check(ROW, None, LIMIT, False, "PX4's version is not told yet")
+            return Check(ROW, None, LIMIT, True, f"PX4 does not tell its version: {_taken(row)}", warns=True)
         if (0, 0) < told.number < OLDEST.number:
             says = f"PX4 is v{told}, must be {LIMIT}: older ones do not tell a failsafe of their own in flight"
             return Check(ROW, str(told), LIMIT, False, says, permanent=True)
