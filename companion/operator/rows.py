@@ -1,9 +1,10 @@
 """Rows of a check as a person reads them, one as it comes, or as JSON for programs."""
 
 import json
-import sys
 from collections.abc import Iterable
 from dataclasses import asdict
+
+import typer
 
 from companion.terminal import one_line, tell
 from companion.wire.operator import Check, unmet, warnings
@@ -20,7 +21,7 @@ def show_rows(rows: Iterable[Check], as_json: bool) -> bool:
             tell(f"{met:5}  {row.name:22}  {value:>20}  {row.limit}")
     faults = unmet(seen)
     if as_json:
-        sys.stdout.write(f"{json.dumps({'fit': not faults, 'checks': [asdict(row) for row in seen]})}\n")
+        typer.echo(json.dumps({"fit": not faults, "checks": [asdict(row) for row in seen]}))
     else:
         for row in (*warnings(seen), *faults):
             tell(one_line(row.message))
