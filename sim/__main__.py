@@ -54,6 +54,9 @@ def up(
         int | None,
         typer.Option(min=0, max=200, help="PX4 instance number of the first vehicle: for a second fleet beside one."),
     ] = None,
+    rehearse: Annotated[
+        bool, typer.Option("--rehearse", help="Fly a hardware file here, by this computer's lines and network.")
+    ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Seed of gusts, noise and estimator origins.")] = 0,
     calm: Annotated[bool, typer.Option("--calm", help="No gusts, no wind and no sensor noise.")] = False,
     gcs: Annotated[
@@ -72,8 +75,9 @@ def up(
 
     Ctrl-C lands the fleet. Exit status: 0 the flight met its criteria, 1 it did not, 2 wrong usage or configuration.
     """
+    from companion.config.checks import faults_on_one_computer
     from companion.config.file import parse
-    from companion.config.overrides import existing_file, fleet_tables, plan_legs
+    from companion.config.overrides import existing_file, fleet_tables, on_this_computer, plan_legs
     from sim.autopilot.stub_fleet import check_stub_links
     from sim.launch.faults import load_scenario
     from sim.launch.launch import FlightOptions, flight_folder, fly
@@ -95,6 +99,8 @@ def up(
         px4 = find_build(px4)
 
     def change(tables: dict[str, Any]) -> None:
+        if rehearse:
+            on_this_computer(tables)
         for table, key, value in (
             ("formation", "shape", formation),
             ("plan", "legs", None if plan is None else plan_legs(plan)),
@@ -112,10 +118,12 @@ def up(
         tables.setdefault("stub", {}).update(
             position_noise_m=0.0, velocity_noise_m_s=0.0, gust_m_s2=0.0, wind_north_m_s=0.0, wind_east_m_s=0.0
         )
-    config = parse(tables, fleet.name)
+    config = parse(tables, str(existing_file(fleet)))
     if len(config.vehicles) > CROWD_PER_CORE * len(os.sched_getaffinity(0)):
         tables.setdefault("limits", {}).setdefault("control_rate_hz", CROWD_RATE_HZ)
-        config = parse(tables, fleet.name)
+        config = parse(tables, str(existing_file(fleet)))
+    if shared := faults_on_one_computer(config):
+        raise ConfigError("\n".join((*shared, "--rehearse flies such a file on one computer")))
     if autopilot == "stub":
         check_stub_links(config)
     elif gcs:

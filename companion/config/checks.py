@@ -4,8 +4,15 @@ from collections.abc import Iterator
 from math import inf, sqrt
 
 from companion.config.derived import FleetConfig
-from companion.config.endpoints import companion_port, is_zenoh_endpoint, serial_endpoint, udp_endpoint
-from companion.config.schema import FenceTable, GotoLegTable, TurnLegTable, VelocityLegTable
+from companion.config.endpoints import (
+    LOOPBACK,
+    companion_port,
+    is_zenoh_endpoint,
+    serial_endpoint,
+    udp_endpoint,
+    zenoh_host,
+)
+from companion.config.schema import FenceTable, GotoLegTable, TurnLegTable, VehicleTable, VelocityLegTable
 from companion.core.formation import minimum_distance
 from companion.core.law.base import FIELDS_MAX
 from companion.core.safety.fence import Fence
@@ -59,39 +66,7 @@ def _table_faults(config: FleetConfig) -> Iterator[str]:
         yield "$.vehicle: at least one vehicle must be enabled"
     if config.stub.signing and config.stub.px4 in ("1.16", "1.17"):
         yield f'$.stub.signing needs $.stub.px4 = "1.18" or "main": PX4 v{config.stub.px4} signs nothing'
-    taken: dict[tuple[str, object], int] = {}
-    for k, v in enumerate(config.vehicle):
-        system_id = v.id + config.launch.first_instance if v.system_id is None else v.system_id
-        if system_id > SYSTEM_ID_MAX:
-            yield (
-                f"$.vehicle[{k}]: its MAVLink system id would be {system_id}, may be {SYSTEM_ID_MAX}: a lower id, or "
-                "a lower $.launch.first_instance"
-            )
-        link = v.mavlink or f"udp://127.0.0.1:{companion_port(config.launch.first_instance + k)}"
-        udp, serial = udp_endpoint(link), serial_endpoint(link)
-        if udp is None and serial is None:
-            yield f"$.vehicle[{k}].mavlink must be udp://HOST:PORT or serial:///dev/NAME:BAUD, got {link!r}"
-        values: list[tuple[str, object]] = [("id", v.id), ("system_id", system_id)]
-        values.append(("mavlink", ("port", udp[1]) if udp else ("device", serial[0] if serial else link)))
-        if v.zenoh is not None:
-            values.append(("zenoh", v.zenoh))
-            if not is_zenoh_endpoint(v.zenoh):
-                yield f"$.vehicle[{k}].zenoh must be PROTOCOL/HOST:PORT with tcp, udp, tls or quic, got {v.zenoh!r}"
-        if config.peers.network == "field" and v.enabled and (v.zenoh is None or v.zenoh.startswith("udp/")):
-            yield (
-                f'$.vehicle[{k}].zenoh must be tcp/HOST:PORT with $.peers.network = "field" (by UDP a pair that loses '
-                f"a declaration stays deaf), got {v.zenoh or 'nothing'}: name the address at which the others reach it"
-            )
-        if v.slot != "auto":
-            values.append(("slot", v.slot))
-            if v.enabled and v.slot >= len(config.vehicles):
-                yield f"$.vehicle[{k}].slot must be below the {len(config.vehicles)} enabled vehicles, got {v.slot}"
-        for name, value in values:
-            if (name, value) in taken:
-                came = value[1] if isinstance(value, tuple) else value
-                yield f"$.vehicle[{k}].{name} must be unique, got {came!r} as in $.vehicle[{taken[name, value]}]"
-            else:
-                taken[name, value] = k
+    yield from _vehicle_faults(config)
     pads = [(v.pad_north_m, v.pad_east_m, 0.0) for v in config.vehicles]
     if minimum_distance(pads) < config.safety_radius_m and config.limits.barrier:
         yield (
@@ -108,6 +83,74 @@ def _table_faults(config: FleetConfig) -> Iterator[str]:
     yield from _plan_faults(config)
     if config.fence is not None:
         yield from _fence_faults(config.fence)
+
+
+def _vehicle_faults(config: FleetConfig) -> Iterator[str]:
+    """What two vehicles share that only one can have, and addresses that are none."""
+    taken: dict[tuple[str, str, object], int] = {}
+    for k, v in enumerate(config.vehicle):
+        system_id = v.id + config.launch.first_instance if v.system_id is None else v.system_id
+        if system_id > SYSTEM_ID_MAX:
+            yield (
+                f"$.vehicle[{k}]: its MAVLink system id would be {system_id}, may be {SYSTEM_ID_MAX}: a lower id, or "
+                "a lower $.launch.first_instance"
+            )
+        link = v.mavlink or f"udp://127.0.0.1:{companion_port(config.launch.first_instance + k)}"
+        line = _line(link)
+        if line is None:
+            yield f"$.vehicle[{k}].mavlink must be udp://HOST:PORT or serial:///dev/NAME:BAUD, got {link!r}"
+        host = _host(v)
+        values: list[tuple[str, str, object]] = [("id", "", v.id), ("system_id", "", system_id)]
+        values.append(("mavlink", f" on {host}" if host else "", line or link))
+        if v.zenoh is not None:
+            values.append(("zenoh", "", v.zenoh))
+            if not is_zenoh_endpoint(v.zenoh):
+                yield f"$.vehicle[{k}].zenoh must be PROTOCOL/HOST:PORT with tcp, udp, tls or quic, got {v.zenoh!r}"
+        if config.peers.network == "field" and v.enabled and (v.zenoh is None or v.zenoh.startswith("udp/")):
+            yield (
+                f'$.vehicle[{k}].zenoh must be tcp/HOST:PORT with $.peers.network = "field" (by UDP a pair that loses '
+                f"a declaration stays deaf), got {v.zenoh or 'nothing'}: name the address at which the others reach it"
+            )
+        if v.slot != "auto":
+            values.append(("slot", "", v.slot))
+            if v.enabled and v.slot >= len(config.vehicles):
+                yield f"$.vehicle[{k}].slot must be below the {len(config.vehicles)} enabled vehicles, got {v.slot}"
+        for value in values:
+            if value in taken:
+                name, where, came = value
+                yield f"$.vehicle[{k}].{name} must be unique{where}, got {came!r} as in $.vehicle[{taken[value]}]"
+            else:
+                taken[value] = k
+
+
+def _line(link: str) -> int | str | None:
+    """The UDP port or the device of a link's URL: one process has it; None if it is neither."""
+    if (udp := udp_endpoint(link)) is not None:
+        return udp[1]
+    serial = serial_endpoint(link)
+    return None if serial is None else serial[0]
+
+
+def _host(vehicle: VehicleTable) -> str:
+    """The computer that a vehicle's companion runs on, as its own address names it; "" is this one.
+
+    Lines and ports are a computer's own: six companions on six computers may all call their line /dev/autopilot.
+    """
+    host = "" if vehicle.zenoh is None else zenoh_host(vehicle.zenoh)
+    return "" if host in LOOPBACK else host
+
+
+def faults_on_one_computer(config: FleetConfig) -> list[str]:
+    """What keeps all companions of a fleet from running on one computer: lines that several have."""
+    found, taken = [], dict[object, int]()
+    for v in config.vehicles:
+        first = taken.setdefault(_line(v.mavlink), v.id)
+        if first != v.id:
+            found.append(
+                f"vehicle {v.id}: mavlink = {v.mavlink!r} is vehicle {first}'s too, and one computer has one of it: "
+                "start `companion run --vehicle ID` on each vehicle's own"
+            )
+    return found
 
 
 def _plan_faults(config: FleetConfig) -> Iterator[str]:

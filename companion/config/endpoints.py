@@ -3,6 +3,9 @@
 import re
 from urllib.parse import urlsplit
 
+LOOPBACK = frozenset({"localhost", "127.0.0.1", "[::1]", "0.0.0.0", "[::]"})
+"""hosts that name the computer itself"""
+
 
 def companion_port(instance: int) -> int:
     """UDP port on which the companion of an instance listens: PX4's for the first ten, since 14550 is the GCS's."""
@@ -35,6 +38,11 @@ def serial_endpoint(url: str) -> tuple[str, int] | None:
     """Device and baud rate of serial:///dev/NAME:BAUD, or None if it is another kind of link."""
     match = re.fullmatch(r"serial://(/[^:]+):(\d+)", url)
     return (match[1], int(match[2])) if match else None
+
+
+def zenoh_host(text: str) -> str:
+    """HOST of PROTOCOL/HOST:PORT: the computer whose sessions listen there."""
+    return text.partition("/")[2].rpartition(":")[0]
 
 
 def is_zenoh_endpoint(text: str) -> bool:

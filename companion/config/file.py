@@ -1,8 +1,10 @@
 """Reads a fleet.toml and validates it."""
 
 import json
+import re
 import tomllib
-from collections.abc import Callable, Mapping
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +23,7 @@ def load(path: Path, change: Callable[[dict[str, Any]], None] | None = None) -> 
 
     Raises ConfigError naming file, place, what came and what is allowed; all faults of the file at once.
     """
-    return parse(read_tables(path, change), path.name)
+    return parse(read_tables(path, change), str(path))
 
 
 def read_tables(path: Path, change: Callable[[dict[str, Any]], None] | None = None) -> dict[str, Any]:
@@ -35,16 +37,19 @@ def read_tables(path: Path, change: Callable[[dict[str, Any]], None] | None = No
 def read_text(path: Path) -> str:
     """What a file holds; ConfigError if it cannot be read."""
     try:
-        return path.read_text(encoding="utf-8")
+        content = path.read_bytes()
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+    try:
+        return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: is not valid TOML: {error}") from error
+        came = "UTF-16" if content.startswith((BOM_UTF16_LE, BOM_UTF16_BE)) else f"{error.reason} at byte {error.start}"
+        raise ConfigError(f"{path}: must be text in UTF-8, got {came}: save it as UTF-8") from error
 
 
 def parse_text(text: str, path: Path) -> FleetConfig:
     """Validate what the file `path` holds: for whoever keeps the text too, which is then the one that was validated."""
-    return parse(_tables(text, path), path.name)
+    return parse(_tables(text, path), str(path))
 
 
 def _tables(text: str, path: Path) -> dict[str, Any]:
@@ -71,8 +76,22 @@ def parse(tables: Mapping[str, Any], name: str) -> FleetConfig:
         config = FleetConfig.model_validate_json(json.dumps(with_message_period(tables), default=str))
     except ValidationError as error:
         found = list(dict.fromkeys(sentence(e, tables) for e in error.errors()))
-        raise ConfigError("\n".join(f"{name}: {fault}" for fault in found)) from error
+        raise _refusal(found, tables, name) from error
     found = faults(config)
     if found:
-        raise ConfigError("\n".join(f"{name}: {fault}" for fault in found))
+        raise _refusal(found, tables, name)
     return config
+
+
+def _refusal(faults: Iterable[str], tables: Mapping[str, Any], name: str) -> ConfigError:
+    """All faults of a file, a line each; the places in its list of vehicles with the ids that stand there."""
+    vehicles = tables.get("vehicle")
+    rows = vehicles if isinstance(vehicles, list) else []
+
+    def ids(fault: str) -> str:
+        places = dict.fromkeys(int(k) for k in re.findall(r"\$\.vehicle\[(\d+)\]", fault))
+        known = {k: rows[k].get("id") for k in places if k < len(rows) and isinstance(rows[k], dict)}
+        said = ", ".join(f"vehicle[{k}] is id {i}" for k, i in known.items() if isinstance(i, int))
+        return f" ({said})" if said else ""
+
+    return ConfigError("\n".join(f"{name}: {fault}{ids(fault)}" for fault in faults))

@@ -85,6 +85,7 @@ class PaperTable(LawTable):
     """Eq. (2) of the paper as it stands, within the acceleration limit."""
 
     kind: Literal["paper"] = "paper"
+    hold: PlainKind = "zero"
     k_s: Gain = 3.0
     k_a: Gain = 3.0
     k_c: Gain = 4.0
@@ -93,6 +94,14 @@ class PaperTable(LawTable):
         """See `LawTable`."""
         gains = paper_gains(self.k_s, self.k_a, self.k_c, r0_m)
         return StarlingLaw(gains._replace(a_max=self.a_max_m_s2, vertical=0.0))
+
+    def faults(self) -> Iterator[str]:
+        """See `LawTable`."""
+        if self.hold == "damped":
+            yield (
+                '$.law.hold must be "zero" (the paper\'s) or "first" with $.law.kind = "paper", got "damped", which is '
+                "none of the paper's: leave it out"
+            )
 
 
 class IntentTable(LawTable):

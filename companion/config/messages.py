@@ -24,7 +24,7 @@ def sentence(error: Any, tables: Mapping[str, Any]) -> str:
     if "slot" in loc:
         # The two kinds of value that a slot may have are two faults to the validator.
         loc = loc[: loc.index("slot") + 1]
-    path = "$" + "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in loc)
+    path = _path(loc)
     came = error["input"]
     match error["type"]:
         case "extra_forbidden":
@@ -33,12 +33,23 @@ def sentence(error: Any, tables: Mapping[str, Any]) -> str:
             return f"{path}.kind must be one of {error['ctx']['known']}, got {error['ctx']['came']!r}"
         case "too_short":
             return f"{path} must have at least {error['ctx']['min_length']}, got {error['ctx']['actual_length']}"
+        case "missing" if isinstance(loc[-1], int):
+            return f"{_path(loc[:-1])} must be {_list_of(loc)}, got {came!r}"
         case "missing":
-            return f"{path} is required"
+            return f"{path} is required{_HEADINGS.get(path, '')}"
         case "string_pattern_mismatch":
-            return f"{path} must match {error['ctx']['pattern']}, got {came!r}"
+            return f"{path} must be {_PATTERNS.get(path, 'as ' + error['ctx']['pattern'])}, got {came!r}"
         case "union_tag_invalid" | "union_tag_not_found":
-            return f"{path}.kind must be one of hold, velocity, turn, goto, got {came!r}"
+            kind = repr(came["kind"]) if isinstance(came, Mapping) and "kind" in came else "none"
+            return f"{path}.kind must be one of {', '.join(_LEGS)}, got {kind}"
+        case "tuple_type" | "list_type" if path == "$.vehicle":
+            return f"{path} must be a list of tables, each headed [[vehicle]] with two brackets, got {came!r}"
+        case "tuple_type" | "list_type":
+            return f"{path} must be {_list_of(loc)}, got {came!r}"
+        case "bool_type" | "bool_parsing":
+            return f"{path} must be true or false, got {came!r}"
+        case "model_type" | "model_attributes_type" | "dict_type":
+            return f"{path} must be a table{_TABLES.get(str(loc[-1]), ' { key = value, ... }')}, got {came!r}"
     unit = next((u for s, u in _UNITS.items() if str(loc[-1]).endswith(s)), "") if loc[-1] != "k_s" else ""
     allowed = _allowed(tuple(loc) if "slot" in loc else error["loc"], tables)
     message = error["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
@@ -46,6 +57,23 @@ def sentence(error: Any, tables: Mapping[str, Any]) -> str:
     return f"{path} {rule}, got {came!r}"
 
 
+def _path(loc: Sequence[str | int]) -> str:
+    return "$" + "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in loc)
+
+
+def _list_of(loc: Sequence[str | int]) -> str:
+    """What the innermost named list of a place holds."""
+    return _VECTORS.get(next(p for p in reversed(loc) if isinstance(p, str)), "a list")
+
+
+_HEADINGS = {"$.fleet": ": a table headed [fleet] with its name", "$.vehicle": ": a table headed [[vehicle]] for each"}
+_PATTERNS = {"$.fleet.name": "at most 32 of a-z, 0-9 and -, the first no -"}
+_VECTORS = {
+    "custom_m": "[forward, right, down] in metres for each vehicle", "pad_m": "[north, east] in metres",
+    "centre_m": "[north, east] in metres", "polygon_m": "[north, east] in metres for each corner",
+    "legs": "a list of legs: [{ kind = ... }, ...]", "informed": "a list of vehicles' ids",
+}  # fmt: skip
+_TABLES = {"origin": " { latitude_deg = ..., longitude_deg = ..., altitude_amsl_m = ... }"}
 _LEGS: Mapping[str, type[BaseModel]] = {
     "hold": HoldLegTable, "velocity": VelocityLegTable, "turn": TurnLegTable, "goto": GotoLegTable
 }  # fmt: skip

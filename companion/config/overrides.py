@@ -4,6 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from companion.config.bounds import NOTICE_LOST_S
 from companion.config.derived import FleetConfig
 from companion.config.file import parse, read_tables
 from companion.errors import ConfigError
@@ -36,7 +37,7 @@ def fleet_tables(
 
 def fleet_config(path: Path, vehicles: int | None = None) -> FleetConfig:
     """A fleet.toml with so many vehicles, validated."""
-    return parse(fleet_tables(path, vehicles), path.name)
+    return parse(fleet_tables(path, vehicles), str(existing_file(path)))
 
 
 def existing_file(path: Path) -> Path:
@@ -52,6 +53,25 @@ def resize(tables: dict[str, Any], count: int) -> None:
     taken = {v.get("id") for v in listed}
     free = (i for i in range(1, 251) if i not in taken)
     tables["vehicle"] = [*listed[:count], *({"id": next(free)} for _ in range(count - len(listed)))]
+
+
+def on_this_computer(tables: dict[str, Any]) -> None:
+    """Give every vehicle this computer's lines and network instead of its own: a hardware file, rehearsed.
+
+    Nobody holds a transmitter here, so none is demanded.
+    """
+    preflight = tables.setdefault("preflight", {})
+    if isinstance(preflight, dict):
+        preflight["require_rc"] = False
+    peers = tables.setdefault("peers", {})
+    if isinstance(peers, dict) and peers.get("network") in NOTICE_LOST_S:
+        peers.setdefault("notice_lost_s", NOTICE_LOST_S[peers["network"]])
+        peers["network"] = "laptop"
+    rows = tables.get("vehicle", [])
+    for row in rows if isinstance(rows, list) else []:
+        if isinstance(row, dict):
+            row.pop("mavlink", None)
+            row.pop("zenoh", None)
 
 
 def plan_legs(text: str) -> list[dict[str, Any]]:

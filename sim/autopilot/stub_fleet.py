@@ -5,6 +5,7 @@ from pathlib import Path
 from random import Random
 
 from companion.config import FleetConfig
+from companion.config.checks import faults_on_one_computer
 from companion.config.derived import Vehicle
 from companion.config.endpoints import autopilot_port, companion_port, udp_endpoint
 from companion.core.frames import Ned
@@ -37,11 +38,13 @@ def _signing_key(vehicle: Vehicle, folder: Path) -> bytes:
 
 def check_stub_links(config: FleetConfig) -> None:
     """Raise ConfigError if a vehicle's link cannot be a stub's; lockstep, which has no sockets, does not mind."""
+    if shared := faults_on_one_computer(config):
+        raise ConfigError("\n".join(shared))
     for v in config.vehicles:
         where = f"vehicle {v.id}: mavlink = {v.mavlink!r}"
         endpoint = udp_endpoint(v.mavlink)
         if endpoint is None or endpoint[0] not in ("0.0.0.0", "127.0.0.1", "localhost"):
-            raise ConfigError(f"{where}: a stub speaks to udp://127.0.0.1:PORT only")
+            raise ConfigError(f"{where}: a stub speaks to udp://127.0.0.1:PORT only (`fleet up --rehearse`)")
         own, _ = _ports(v)
         if own > 65535:
             raise ConfigError(f"{where}: the stub's own port would be {own}; the companion's must be lower")

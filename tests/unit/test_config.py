@@ -14,9 +14,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.config import FleetConfig, load
+from companion.config.checks import faults_on_one_computer
 from companion.config.endpoints import autopilot_port, companion_port, serial_endpoint, udp_endpoint
 from companion.config.file import parse
-from companion.config.overrides import plan_legs, resize
+from companion.config.overrides import on_this_computer, plan_legs, resize
 from companion.core.frames import Ned
 from companion.core.law.starling import StarlingLaw
 from companion.core.monitor import own_error_m
@@ -124,7 +125,7 @@ def test_every_number_that_is_not_finite_or_absurd_or_no_number_is_refused_by_na
 
 VELOCITY, TURN = "plan.legs.0", "plan.legs.1"
 RANGES = [
-    ("fleet.name", "Two Words", "must match"),
+    ("fleet.name", "Two Words", "must be at most 32 of a-z"),
     ("fleet.frame", "body", "must be 'global' or 'local'"),
     ("fleet.origin.latitude_deg", 90.1, "a finite number >= -90 and <= 90 deg"),
     ("fleet.origin.longitude_deg", -181.0, "a finite number >= -180 and <= 180 deg"),
@@ -135,7 +136,7 @@ RANGES = [
     ("formation.altitude_m", 0.5, "a finite number >= 1 and <= 500 m"),
     ("plan.then", "hover", "'stay', 'land' or 'return'"),
     ("plan.heading", "north", "'fixed' or 'track'"),
-    ("plan.automatic", 1, "a valid boolean"),
+    ("plan.automatic", 1, "true or false"),
     (f"{VELOCITY}.kind", "loop", "one of hold, velocity, turn, goto"),
     (f"{VELOCITY}.duration_s", 0, "a finite number > 0 and <= 86400 s"),
     (f"{TURN}.rate_deg_s", 61.0, "a finite number >= -60 and <= 60 deg/s"),
@@ -163,7 +164,7 @@ RANGES = [
     ("peers.wait_s", 1e-9, "a finite number >= 1 and <= 3600 s"),
     ("peers.isolated_flight_s", 0.5, "a finite number >= 1 and <= 3600 s"),
     ("failsafe.isolated_hold_s", 1e5, "a finite number >= 1 and <= 3600 s"),
-    ("limits.barrier", "yes", "a valid boolean"),
+    ("limits.barrier", "yes", "true or false"),
     ("fence.radius_m", 0.0, "a finite number > 0 and <= 100000 m"),
     ("fence.floor_m", -501.0, "a finite number >= -500 and <= 1000 m"),
     ("fence.ceiling_m", 1001, "a finite number >= -500 and <= 1000 m"),
@@ -186,7 +187,7 @@ RANGES = [
     ("preflight.altitude_spread_m", 0, "a finite number > 0"),
     ("preflight.pad_limit_m", 0, "a finite number > 0"),
     ("preflight.offboard_loss_limit_s", 61, "a finite number > 0 and <= 5 s"),
-    ("preflight.require_rc", 1, "valid boolean"),
+    ("preflight.require_rc", 1, "true or false"),
     ("stub.dynamics", "rigid", "'px4' or 'ideal'"),
     ("vehicle.0.id", 0, "a whole number >= 1 and <= 250"),
     ("vehicle.0.id", 251, "a whole number >= 1 and <= 250"),
@@ -254,6 +255,46 @@ def test_what_two_vehicles_share_is_refused_with_both_their_places(
     one: Change, other: Change | None, text: str
 ) -> None:
     assert text in refusal(one, *([other] if other else []))
+
+
+def on_computers(*lines: str, host: str = "10.0.0.{k}") -> Change:
+    """Vehicles of a mesh, each on the computer that its address names, with these lines to their autopilots."""
+
+    def change(tables: Tables) -> None:
+        tables["peers"]["network"] = "field"
+        tables["vehicle"] = [
+            {"id": k, "mavlink": line, "zenoh": f"tcp/{host.format(k=k)}:{7446 + k}"} for k, line in enumerate(lines, 1)
+        ]
+
+    return change
+
+
+LINES = ("serial:///dev/autopilot:921600", "udp://0.0.0.0:14540")
+
+
+@pytest.mark.parametrize("line", LINES)
+def test_lines_of_one_name_on_several_computers_are_as_many_lines(line: str) -> None:
+    config = parse(changed(on_computers(*[line] * 6)), "fleet.toml")
+    assert [v.mavlink for v in config.vehicles] == [line] * 6
+    assert faults_on_one_computer(config)[0].startswith(f"vehicle 2: mavlink = {line!r} is vehicle 1's too")
+    assert len(faults_on_one_computer(config)) == 5
+
+
+@pytest.mark.parametrize(("host", "where"), [("10.0.0.1", " on 10.0.0.1"), ("127.0.0.1", ""), ("[::1]", "")])
+@pytest.mark.parametrize("line", LINES)
+def test_lines_of_one_name_on_one_computer_are_refused(line: str, host: str, where: str) -> None:
+    assert f"$.vehicle[1].mavlink must be unique{where}, got" in refusal(on_computers(line, line, host=host))
+
+
+def test_a_hardware_file_is_rehearsed_on_one_computer_with_its_own_network_limits() -> None:
+    tables = changed(on_computers(*[LINES[0]] * 6), put("preflight.require_rc", True))
+    hardware = parse(tables, "fleet.toml")
+    on_this_computer(tables)
+    here = parse(tables, "fleet.toml")
+    assert not faults_on_one_computer(here)
+    assert (here.peers.network, here.notice_lost_s) == ("laptop", hardware.notice_lost_s)
+    assert [v.mavlink for v in here.vehicles] == [f"udp://127.0.0.1:{companion_port(k)}" for k in range(6)]
+    assert not here.preflight.require_rc
 
 
 def line_of(*slots: list[float]) -> Change:
@@ -479,7 +520,7 @@ def test_without_the_barrier_slots_need_only_keep_out_of_separations_range() -> 
     assert parse(tables, "fleet.toml").spacing_min_m == pytest.approx(0.7)
 
 
-@pytest.mark.parametrize("text", ["[fleet", "name = ", "\xff\xfe"])
+@pytest.mark.parametrize("text", ["[fleet", "name = "])
 def test_a_file_that_is_no_toml_is_refused_by_name(tmp_path: Path, text: str) -> None:
     path = tmp_path / "mine.toml"
     path.write_bytes(text.encode("latin-1"))
@@ -627,8 +668,9 @@ def test_the_returning_hold_follows_the_laws_own_pull_and_is_no_other_laws() -> 
 
 
 def test_the_papers_law_is_selectable() -> None:
-    tables = changed(put("law.kind", "paper"), put("law.hold", "zero"), put("trigger.kind", "switching"))
+    tables = changed(put("law.kind", "paper"), put("trigger.kind", "switching"))
     config = parse(tables, "fleet.toml")
+    assert config.law.holding() == PlainHold("zero", 0.7)
     law = config.law.law(config.r0_m)
     assert isinstance(law, StarlingLaw)
     assert law.gains.normalise == 0.0
