@@ -7,13 +7,13 @@ from typing import Annotated
 
 import typer
 
+from companion.about import COMMAND, with_version
 from companion.errors import CompanionError, ConfigError, libraries_of
 from companion.operator import verbs
 from companion.terminal import tell, tolerate_any_encoding
 
-app = typer.Typer(
-    no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, help="One vehicle's companion process."
-)
+app = typer.Typer(help="One vehicle's companion process.", **COMMAND)
+app.callback()(with_version)
 operator_app = typer.Typer(no_args_is_help=True, help="Command and ask a running fleet, without the simulator.")
 verbs.mount(operator_app)
 app.add_typer(operator_app, name="operator")

@@ -23,17 +23,22 @@ def shipped(name: str) -> Path:
     raise ConfigError(f"{name} did not come with this installation; install the package anew")
 
 
-def write_shipped(folder: Path) -> list[Path]:
-    """Write both files to a folder; ConfigError, and nothing written, if one is there already."""
-    if not folder.is_dir():
-        raise ConfigError(f"{folder} is not a folder")
-    targets = {folder / name: shipped(name) for name in _FOLDERS}
+def write_shipped(folder: Path, fleet_text: str) -> list[Path]:
+    """Write both files, with this text for the fleet's, to a folder; one that is not there is made.
+
+    ConfigError, and nothing written, if one of the files is there already.
+    """
+    targets = {
+        folder / FLEET_FILE: fleet_text.encode(),
+        folder / SERVICE_FILE: shipped(SERVICE_FILE).read_bytes(),
+    }
     there = [str(target) for target in targets if target.exists()]
     if there:
         raise ConfigError(f"{', '.join(there)} is there already: name another folder, or move it away")
     try:
-        for target, source in targets.items():
-            target.write_bytes(source.read_bytes())
+        folder.mkdir(parents=True, exist_ok=True)
+        for target, content in targets.items():
+            target.write_bytes(content)
     except OSError as error:
         raise ConfigError(f"{folder}: cannot be written: {error.strerror}") from error
     return list(targets)

@@ -10,17 +10,16 @@ from typing import Annotated, Any
 
 import typer
 
+from companion.about import COMMAND, with_version
 from companion.errors import CompanionError, ConfigError, MissingLibraryError, libraries_of
 from companion.operator import verbs
-from companion.operator.verbs import FAILED, FLEET_TOML, FleetFile, Vehicles
+from companion.operator.verbs import FAILED, FLEET_TOML, FleetFile, OperatedFile, Vehicles
 from companion.terminal import tell, tolerate_any_encoding
 from sim.autopilot.faults import Fault, FaultKind
 from sim.study import FLOWN_STUDIES, STUDIES
 
-app = typer.Typer(
-    no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
-    help="A fleet of PX4 vehicles or of stubs: fly it, ask it, command it.",
-)  # fmt: skip
+app = typer.Typer(help="A fleet of PX4 vehicles or of stubs: fly it, ask it, command it.", **COMMAND)
+app.callback()(with_version)
 
 Parameters = Annotated[
     list[str] | None, typer.Option(metavar="NAME=VALUE", help="With --autopilot px4: a PX4 parameter, repeatable.")
@@ -200,17 +199,18 @@ def fault(
     wind: Annotated[
         tuple[float, float], typer.Option(help="Of a wind: where the air flows to, north and east, m/s.")
     ] = (0.0, 0.0),
-    fleet: FleetFile = FLEET_TOML,
+    fleet: OperatedFile = None,
     vehicles: Vehicles = None,
 ) -> None:
     """Have a stub or a simulated PX4 of a running fleet suffer a fault; exit status 1 if it does not answer."""
     from companion.config.overrides import fleet_config
     from companion.core.frames import Ned
+    from companion.operator.flying import operated_file
     from sim.launch.faults import order_fault
 
     if kind not in tuple(FaultKind):
         raise ConfigError(f"fault must be one of {', '.join(FaultKind)}, got {kind!r}")
-    config = fleet_config(fleet, vehicles)
+    config = fleet_config(operated_file(fleet), vehicles)
     lasts_s = float("inf") if duration is None else duration
     try:
         ordered = Fault(FaultKind(kind), magnitude, lasts_s, wind_ned_m_s=Ned(*wind, 0.0))
@@ -235,6 +235,20 @@ def doctor(
     from sim.launch.doctor import doctor_checks
 
     raise typer.Exit(0 if show_rows(doctor_checks(fleet_config(fleet, vehicles)), as_json) else FAILED)
+
+
+@app.command()
+def check(
+    file: Annotated[Path, typer.Argument(help="The fleet's configuration; without it ./fleet.toml.")] = FLEET_TOML,
+    vehicles: Vehicles = None,
+) -> None:
+    """Read a fleet file as the vehicles do, and tell what follows from it. Exit status: 0 fit to fly, 2 it is not."""
+    from companion.config.overrides import existing_file, fleet_config
+    from companion.operator.facts import facts
+
+    for what, value, why in facts(fleet_config(file, vehicles)):
+        tell(f"{what:13}  {value:30}  {why}")
+    tell(f"{existing_file(file)}: fit to fly")
 
 
 @app.command(hidden=True)

@@ -1,12 +1,12 @@
 """What follows from fleet.toml, the same in every vehicle."""
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from hashlib import blake2s
 from math import ceil, inf, radians, sqrt
 from pathlib import Path
-from typing import Literal
+from typing import Any, Final, Literal
 
 from companion.config.bounds import SPACING_MARGIN_M, FleetBounds
 from companion.config.endpoints import companion_port
@@ -36,6 +36,7 @@ STALE_AFTER = 2.1
 """a peer is stale after this many T_max without a word: one message may be lost"""
 PROCESS_END_S = 1.5
 """on a laptop processes end and no computer does: that is told within so long"""
+DIGEST_LETTERS: Final = 4
 NEAREST_ABOVE = 20
 """a larger fleet without a plan heeds the nearest, unless told otherwise"""
 
@@ -281,7 +282,39 @@ class FleetConfig(FleetBounds):
     def shared_hash(self) -> str:
         """Digest of what the vehicles must agree on: everything but links and the stubs' noise, the packages of
         foreign kinds included."""
+        return blake2s(json.dumps(self._shared, sort_keys=True).encode(), digest_size=8).hexdigest()
+
+    @cached_property
+    def _shared(self) -> dict[str, Any]:
         shared = self.model_dump(exclude={"stub": True, "vehicle": {"__all__": {"mavlink", "zenoh"}}})
-        if self.foreign:
-            shared["foreign"] = self.foreign
-        return blake2s(json.dumps(shared, sort_keys=True).encode(), digest_size=8).hexdigest()
+        return {**shared, "foreign": self.foreign} if self.foreign else shared
+
+    @cached_property
+    def shared_digests(self) -> dict[str, str]:
+        """Of each table that the vehicles must agree on: so many letters for each of its keys, in their order."""
+        return {table: "".join(_digest(x) for _, x in _rows(value)) for table, value in self._shared.items()}
+
+    def differing(self, digests: Mapping[str, str]) -> list[str]:
+        """The keys of which somebody else's digests tell another value; of a table of another length its name."""
+        found = []
+        for table, own in self.shared_digests.items():
+            other = digests.get(table, "")
+            if len(own) != len(other):
+                found.append(table)
+                continue
+            for k, (key, _) in enumerate(_rows(self._shared[table])):
+                place = slice(k * DIGEST_LETTERS, (k + 1) * DIGEST_LETTERS)
+                if own[place] != other[place]:
+                    found.append(f"{table}{key}")
+        return [*found, *(table for table in digests if table not in self.shared_digests)]
+
+
+def _rows(value: Any) -> list[tuple[str, Any]]:
+    """The values of a table or a list, each with its key as it is written after the table's name."""
+    if isinstance(value, dict):
+        return [(f".{key}", value[key]) for key in sorted(value)]
+    return [(f"[{k}]", x) for k, x in enumerate(value)] if isinstance(value, list | tuple) else [("", value)]
+
+
+def _digest(value: Any) -> str:
+    return blake2s(json.dumps(value, sort_keys=True).encode(), digest_size=DIGEST_LETTERS // 2).hexdigest()

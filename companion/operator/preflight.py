@@ -24,6 +24,7 @@ from companion.wire.operator import Check, PreflightReport, tidy, unmet, warning
 
 BODY_M = 0.5
 """closer than this two vehicles touch; what is kept where the barrier is off"""
+KEYS_SHOWN_MAX = 6
 OPERATOR_CLOCK_LIMIT_S = 1.0
 """commanded motions start two seconds ahead by the operator's clock"""
 
@@ -124,14 +125,23 @@ def _agreement(config: FleetConfig, heard: Mapping[int, PreflightReport]) -> Ite
     for i, a in heard.items():
         same = a.configuration == config.shared_hash
         yield Check(
-            "configuration", a.configuration, f"= {config.shared_hash}", same,
-            f"its fleet.toml differs from the operator's (hash {a.configuration}, must be {config.shared_hash})",
+            "configuration", a.configuration, f"= {config.shared_hash}", same, "" if same else _difference(config, a),
             True, i,
         )  # fmt: skip
         yield Check(
             "assignment", a.assignment, f"= {assignment}", a.assignment == assignment,
             f"assigns the slots otherwise than the operator (hash {a.assignment}, must be {assignment})", True, i,
         )  # fmt: skip
+
+
+def _difference(config: FleetConfig, answer: PreflightReport) -> str:
+    """In which keys a vehicle's file is another, or that its digests do not tell."""
+    keys = config.differing(answer.digests) if answer.digests else []
+    more = f" and {len(keys) - KEYS_SHOWN_MAX} more" if len(keys) > KEYS_SHOWN_MAX else ""
+    where = f" in {', '.join(keys[:KEYS_SHOWN_MAX])}{more}" if keys else ""
+    return (
+        f"its fleet.toml differs from the operator's{where} (hash {answer.configuration}, must be {config.shared_hash})"
+    )
 
 
 def _clocks(

@@ -27,6 +27,12 @@ FOUND_WITHIN_S = 2.0
 PANEL = "Command and ask a running fleet"
 
 FleetFile = Annotated[Path, typer.Option("--fleet", help="The fleet's configuration: the same file as the vehicles'.")]
+OperatedFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--fleet", help="The vehicles' file; left out: that of the flight on this computer, else ./fleet.toml."
+    ),
+]
 Vehicles = Annotated[int | None, typer.Option(min=1, max=250, help="So many vehicles, whatever the file lists.")]
 OneVehicle = Annotated[int | None, typer.Option(min=1, max=250, help="This vehicle's id alone; without it, all.")]
 Both = Annotated[
@@ -44,22 +50,41 @@ def mount(app: typer.Typer) -> None:
 
 def init(
     folder: Annotated[Path, typer.Argument(help="Where the files go.")] = Path(),
+    vehicles: Annotated[int | None, typer.Option(min=1, max=250, help="So many vehicles; left out: ten.")] = None,
+    name: Annotated[str | None, typer.Option(help="The fleet's name: a-z, 0-9 and -.")] = None,
+    network: Annotated[
+        str, typer.Option(help="laptop, or field: a computer and an address for each vehicle.")
+    ] = "laptop",
+    first_address: Annotated[
+        str | None,
+        typer.Option(help="With --network field: IPv4 address of the first vehicle (10.0.0.11); the others' follow."),
+    ] = None,
+    line: Annotated[
+        str | None,
+        typer.Option(help="With --network field: each computer's line (serial:///dev/autopilot:921600)."),
+    ] = None,
 ) -> None:
-    """Write the shipped fleet.toml and the companion's systemd unit, to be edited. Overwrites nothing."""
+    """Write a commented fleet.toml and the companion's systemd unit, to be edited. Asks nothing, overwrites nothing.
+
+    Example: init my-fleet --vehicles 6 --network field --first-address 192.168.1.11
+    """
+    from companion.config.new_file import new_fleet_text
     from companion.shipped import write_shipped
 
-    for path in write_shipped(folder):
+    text = new_fleet_text(vehicles, name, network, first_address, line)
+    for path in write_shipped(folder, text):
         tell(f"written: {path}")
 
 
 @contextmanager
-def connected(fleet: Path, vehicles: int | None, *, both: bool = False) -> "Iterator[Operator]":
+def connected(fleet: Path | None, vehicles: int | None, *, both: bool = False) -> "Iterator[Operator]":
     """An operator whose network is open."""
     from companion.config.overrides import fleet_config
     from companion.io.network import operator_link
     from companion.operator.client import Operator
+    from companion.operator.flying import operated_file
 
-    config = fleet_config(fleet, vehicles)
+    config = fleet_config(operated_file(fleet), vehicles)
     with operator_link(config) as link:
         operator = Operator(config, link, both=both)
         link.wait_alive(operator.ids, FOUND_WITHIN_S)
@@ -67,7 +92,7 @@ def connected(fleet: Path, vehicles: int | None, *, both: bool = False) -> "Iter
 
 
 def command(
-    fleet: Path, vehicles: int | None, verb: str, act: "Callable[[Operator], Answers]", *, both: bool = False
+    fleet: Path | None, vehicles: int | None, verb: str, act: "Callable[[Operator], Answers]", *, both: bool = False
 ) -> None:
     """Command the fleet, tell what it said, and end."""
     with connected(fleet, vehicles, both=both) as operator:
@@ -77,7 +102,7 @@ def command(
 
 
 def status(
-    fleet: FleetFile = FLEET_TOML,
+    fleet: OperatedFile = None,
     vehicles: Vehicles = None,
     as_json: Annotated[bool, typer.Option("--json", help="Each vehicle's own account as JSON.")] = False,
 ) -> None:
@@ -103,7 +128,7 @@ def status(
 
 
 def preflight(
-    fleet: FleetFile = FLEET_TOML,
+    fleet: OperatedFile = None,
     vehicles: Vehicles = None,
     explain: Annotated[bool, typer.Option("--explain", help="Every check with its value and its limit.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Every check as JSON.")] = False,
@@ -123,31 +148,29 @@ def preflight(
     raise typer.Exit(0 if report.fit else FAILED)
 
 
-def takeoff(fleet: FleetFile = FLEET_TOML, vehicles: Vehicles = None) -> None:
+def takeoff(fleet: OperatedFile = None, vehicles: Vehicles = None) -> None:
     """Arm and climb, after a preflight across the fleet; whoever is at fault is named and nobody takes off."""
     command(fleet, vehicles, "take-off", lambda o: o.take_off())
 
 
-def land(
-    fleet: FleetFile = FLEET_TOML, vehicles: Vehicles = None, vehicle: OneVehicle = None, both: Both = False
-) -> None:
+def land(fleet: OperatedFile = None, vehicles: Vehicles = None, vehicle: OneVehicle = None, both: Both = False) -> None:
     """Land every vehicle, or one, where it is."""
     command(fleet, vehicles, "land", lambda o: o.land(vehicle), both=both)
 
 
-def rtl(fleet: FleetFile = FLEET_TOML, vehicles: Vehicles = None) -> None:
+def rtl(fleet: OperatedFile = None, vehicles: Vehicles = None) -> None:
     """Fly back over the pads, each vehicle over its own, and land there."""
     command(fleet, vehicles, "rtl", lambda o: o.rtl(time.time_ns()))
 
 
-def hold(fleet: FleetFile = FLEET_TOML, vehicles: Vehicles = None) -> None:
+def hold(fleet: OperatedFile = None, vehicles: Vehicles = None) -> None:
     """Stop the formation where it is; it stays there until it is commanded on."""
     command(fleet, vehicles, "hold", lambda o: o.hold(time.time_ns))
 
 
 def form(
     shape: Annotated[str, typer.Argument(help="v, line, column, circle, grid, spiral, sphere or custom.")],
-    fleet: FleetFile = FLEET_TOML,
+    fleet: OperatedFile = None,
     vehicles: Vehicles = None,
 ) -> None:
     """Change the formation; its motion goes on. Example: form line."""
@@ -177,7 +200,7 @@ def move(
         list[int] | None,
         typer.Option(min=1, max=250, help="Tell this vehicle alone, and again for others: the rest follow unasked."),
     ] = None,
-    fleet: FleetFile = FLEET_TOML,
+    fleet: OperatedFile = None,
     vehicles: Vehicles = None,
 ) -> None:
     """Change the formation's motion: one of --velocity, --turn, --goto, --free.
@@ -224,7 +247,7 @@ def scare(
         float, typer.Option(min=1, max=50, help="Who is nearer than this to its way of the next 2 s flees (m).")
     ] = 10.0,
     lasts: Annotated[float, typer.Option("--for", min=0.5, max=60, help="For so long it is there (s).")] = 10.0,
-    fleet: FleetFile = FLEET_TOML,
+    fleet: OperatedFile = None,
     vehicles: Vehicles = None,
 ) -> None:
     """Have vehicles flee a point, in a fleet that flies without a shared motion.
@@ -254,19 +277,19 @@ def scare(
 
 
 def release(
-    fleet: FleetFile = FLEET_TOML, vehicles: Vehicles = None, vehicle: OneVehicle = None, both: Both = False
+    fleet: OperatedFile = None, vehicles: Vehicles = None, vehicle: OneVehicle = None, both: Both = False
 ) -> None:
     """Give every vehicle, or one, to the pilot: its companion sends no setpoint, its autopilot holds."""
     command(fleet, vehicles, "release", lambda o: o.release(vehicle), both=both)
 
 
-def resume(fleet: FleetFile = FLEET_TOML, vehicles: Vehicles = None, vehicle: OneVehicle = None) -> None:
+def resume(fleet: OperatedFile = None, vehicles: Vehicles = None, vehicle: OneVehicle = None) -> None:
     """Steer again what was released, or was in the air when its companion started: it stands, then comes back."""
     command(fleet, vehicles, "resume", lambda o: o.resume(vehicle))
 
 
 def kill(
-    fleet: FleetFile = FLEET_TOML,
+    fleet: OperatedFile = None,
     vehicles: Vehicles = None,
     vehicle: OneVehicle = None,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,

@@ -226,6 +226,7 @@ class OperatorPort:
             home_altitude_amsl_m=facts.home_altitude_amsl_m,
             own_id_heard=self.publisher.own_id_heard(now),
             checks=self.checks(now),
+            digests=self.config.shared_digests,
         )
 
     # -- status --------------------------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ are passed over, so that a newer companion may tell more.
 
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import isfinite
 from typing import Annotated, Any, Final, Literal, NamedTuple, TypeVar, get_args
 
@@ -253,6 +253,8 @@ class PreflightReport:
     own_id_heard: bool
     """whether somebody else speaks under its id"""
     checks: Annotated[tuple[Check, ...], Field(max_length=200)]
+    digests: Annotated[dict[_Word, _Text], Field(max_length=40)] = field(default_factory=dict)
+    """of each table of its fleet.toml (`FleetConfig.shared_digests`)"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

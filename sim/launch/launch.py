@@ -2,26 +2,26 @@
 
 import json
 import signal
-import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import tomli_w
 
+from companion.about import versions
 from companion.config import FleetConfig
 from companion.config.file import parse
 from companion.errors import CompanionError, RefusedError
 from companion.io.network import operator_link
 from companion.io.signing_key import make_key
 from companion.operator.client import Operator
+from companion.operator.flying import noted
 from sim.autopilot.faults import FaultKind
 from sim.autopilot.stubs import TRUTH_DTYPE
 from sim.launch.faults import CompanionFault, CompanionFaultKind, ScheduledFault
@@ -39,7 +39,6 @@ CROWD_NICENESS = 10
 """more companions than CROWD want more than two processors: they get less, each its share, and not the one process that
 simulates all autopilots, without which nobody flies"""
 AUTOPILOTS_GRACE_S = 12.0
-LIBRARIES = ("starling-fleet", "pymavlink", "eclipse-zenoh", "numpy", "pydantic", "mcap")
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,9 +94,11 @@ def fly(
     `tables` is fleet.toml with its overrides. Raises CompanionError when the fleet does not come up.
     """
     processes = FleetProcesses(options.folder)
+    launch = _Launch(options, processes, show, interrupted, tell)
     try:
         processes.open()
-        return _Launch(options, processes, show, interrupted, tell).fly(tables)
+        with noted(tables["fleet"]["name"], launch.file):
+            return launch.fly(tables)
     finally:
         processes.close()
 
@@ -116,7 +117,8 @@ class _Launch:
     _niceness: int = 0
 
     @property
-    def _file(self) -> Path:
+    def file(self) -> Path:
+        """The flight's own fleet.toml."""
         return self.options.folder / "fleet.toml"
 
     @property
@@ -166,7 +168,7 @@ class _Launch:
         if config.stub.signing and self.options.px4 is None and not self.options.external:
             self._make_keys(tables, config)
             config = parse(tables, "fleet.toml")
-        _write(self._file, tomli_w.dumps(_without_none(tables)))
+        _write(self.file, tomli_w.dumps(_without_none(tables)))
         return config
 
     def _make_keys(self, tables: dict[str, Any], config: FleetConfig) -> None:
@@ -178,7 +180,7 @@ class _Launch:
                 make_key(self.options.folder / row["signing_key"])
 
     def _start_autopilots(self) -> None:
-        options, file = self.options, str(self._file)
+        options, file = self.options, str(self.file)
         self.processes.fork("reference", ReferenceJob(str(options.folder / "reference.bin")))
         if options.px4 is not None:
             more = [word for p in options.parameters for word in ("--parameter", p)]
@@ -198,7 +200,7 @@ class _Launch:
         for i in ids:
             if self.interrupted():
                 raise CompanionError("interrupted before take-off")
-            job = CompanionJob(i, str(self._file), str(self._recording(i)))
+            job = CompanionJob(i, str(self.file), str(self._recording(i)))
             self._niceness = CROWD_NICENESS if len(ids) > CROWD else 0
             self.processes.fork(f"companion-{i}", job, self._niceness)
 
@@ -217,7 +219,7 @@ class _Launch:
         self.processes.end([name], 0.0, signal.SIGKILL)
         if fault.kind is CompanionFaultKind.RESTARTED:
             start = self.starts[vehicle_id] = self.starts.get(vehicle_id, 1) + 1
-            job = CompanionJob(vehicle_id, str(self._file), str(self._recording(vehicle_id, start)))
+            job = CompanionJob(vehicle_id, str(self.file), str(self._recording(vehicle_id, start)))
             self.processes.fork(name, job, self._niceness)
 
     def _leave_out(self, tables: dict[str, Any], ids: list[int], missing: Mapping[int, str]) -> FleetConfig:
@@ -257,7 +259,7 @@ class _Launch:
             lost=lost,
             autopilots_lost=autopilots_lost,
             disarmed={i: not said.armed for i, said in watch.said.items()},
-            versions={"python": sys.version.split()[0], **{name: version(name) for name in LIBRARIES}},
+            versions=versions(),
         )
         for i in watch.ids:
             flight.read_files(i, self._recordings(i))

@@ -129,6 +129,8 @@ class Flown:
     seen: dict[str, dict[int, Status]] = field(default_factory=dict)
     """what the vehicles said: before, and after each verb"""
     after_garbage: dict[int, Status | None] = field(default_factory=dict)
+    unnamed: subprocess.CompletedProcess[str] = field(default_factory=lambda: subprocess.CompletedProcess([], -1))
+    """`status` without --fleet, from another folder whose file has no more than the fleet's name"""
     status_of_five: tuple[int, dict[int, Status | None]] = (-1, {})
 
     def say(self, verb: str, *arguments: str) -> None:
@@ -207,6 +209,10 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
         flown.say("hold")
         flown.seen["hold"] = wait_status(operator, lambda said: True)
         flown.status_of_five = status_json(fleet, five(fleet))
+        elsewhere = fleet.folder / "elsewhere"
+        elsewhere.mkdir()
+        (elsewhere / "fleet.toml").write_text(f'[fleet]\nname = "{fleet.config.fleet.name}"\n')
+        flown.unnamed = run("sim", "status", folder=elsewhere)
         flown.say("land")
         flown.exit_status = up.wait()
         flown.out, flown.err = up.out, up.err
@@ -296,6 +302,12 @@ def test_verbs_show_in_the_next_status(flown: Flown) -> None:
     (leg,) = flown.seen["move"][1].motion["legs"]
     assert leg["velocity_ned_m_s"] == [0.0, 0.5, 0.0]
     assert flown.seen["hold"][1].motion["legs"][0]["velocity_ned_m_s"] == [0.0, 0.0, 0.0]
+
+
+def test_a_verb_without_a_file_reaches_the_flight_of_the_name_that_its_folders_file_has(flown: Flown) -> None:
+    assert flown.unnamed.returncode == 0, flown.unnamed.stderr
+    first_words = [line.split()[0] for line in flown.unnamed.stdout.splitlines() if line.strip()]
+    assert [word for word in first_words if word.isdigit()] == ["1", "2", "3", "4"]
 
 
 def test_a_vehicle_that_is_not_there_is_named_as_silent(flown: Flown) -> None:

@@ -117,7 +117,8 @@ def test_every_vehicle_and_value_at_fault_is_named_at_once(looked: Looked) -> No
     assert "not heard: vehicle 4" in faults
     assert any(f.startswith("vehicle 1: COM_OBL_RC_ACT is 0, must be 4 or 5: ") for f in faults)
     assert "vehicle 2: battery at 12 %, must have 30 %" in faults
-    assert any(f.startswith("vehicle 3: its fleet.toml differs from the operator's (hash ") for f in faults)
+    says = "vehicle 3: its fleet.toml differs from the operator's in formation.shape (hash "
+    assert any(f.startswith(says) for f in faults)
     assert any(f.startswith("vehicle 3: assigns the slots otherwise") for f in faults)
     assert {f.split(":")[0] for f in faults} <= {"not heard", *(f"vehicle {i}" for i in (1, 2, 3))}
 

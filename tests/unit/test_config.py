@@ -667,6 +667,34 @@ def test_the_returning_hold_follows_the_laws_own_pull_and_is_no_other_laws() -> 
         parse(tables, "fleet.toml")
 
 
+DIFFERING = {
+    "nothing": ((), []),
+    "a link": ((put("vehicle.2.mavlink", "udp://127.0.0.1:15000"),), []),
+    "a gain": ((put("law.k_s", 2.5),), ["law.k_s"]),
+    "keys of two tables": (
+        (put("formation.altitude_m", 11.0), put("peers.digest", 4)), ["formation.altitude_m", "peers.digest"],
+    ),
+    "another law": ((put("law", {"kind": "paper"}),), ["law"]),
+    "no fence": ((drop("fence"),), ["fence"]),
+    "a pad": ((put("vehicle.2.pad_m", [8.0, 8.0]),), ["vehicle[2]"]),
+    "a vehicle fewer": ((drop("vehicle.9"),), ["vehicle"]),
+    "the legs": ((drop("plan.legs.0"),), ["plan.legs"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", DIFFERING)
+def test_the_keys_in_which_two_files_differ_are_named(name: str) -> None:
+    changes, keys = DIFFERING[name]
+    own, other = parse(default_tables(), "fleet.toml"), parse(changed(*changes), "fleet.toml")
+    assert own.differing(other.shared_digests) == other.differing(own.shared_digests) == keys
+    assert (own.shared_hash == other.shared_hash) is (not keys)
+
+
+def test_a_table_that_is_not_ours_is_named() -> None:
+    own = parse(default_tables(), "fleet.toml")
+    assert own.differing({**own.shared_digests, "foreign": "1234"}) == ["foreign"]
+
+
 def test_the_papers_law_is_selectable() -> None:
     tables = changed(put("law.kind", "paper"), put("trigger.kind", "switching"))
     config = parse(tables, "fleet.toml")

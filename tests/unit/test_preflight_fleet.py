@@ -99,6 +99,15 @@ def test_two_processes_under_one_id_are_named(own_id_heard: bool) -> None:
 def test_files_and_assignments_that_differ_are_named() -> None:
     (said,) = report({3: account(3, configuration="0123")}).faults
     assert said.startswith("vehicle 3: its fleet.toml differs from the operator's (hash 0123, must be ")
+    theirs = config(law={"k_s": 2.5}, peers={"digest": 5})
+    (said,) = report({3: account(3, configuration="0123", digests=theirs.shared_digests)}).faults
+    assert said.startswith(
+        "vehicle 3: its fleet.toml differs from the operator's in law.k_s, peers.digest (hash 0123, "
+    )
+    other = {f"{name}_m_s2": 1.0 for name in "abcdefgh"}
+    digests = {**CONFIG.shared_digests, **dict.fromkeys(other, "0000")}
+    (said,) = report({3: account(3, configuration="0123", digests=digests)}).faults
+    assert "in a_m_s2, b_m_s2, c_m_s2, d_m_s2, e_m_s2, f_m_s2 and 2 more (hash 0123" in said
     (said,) = report({1: account(1, assignment="4567")}).faults
     assert said.startswith("vehicle 1: assigns the slots otherwise than the operator (hash 4567, must be ")
 

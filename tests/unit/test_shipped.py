@@ -12,10 +12,11 @@ from companion.errors import ConfigError
 from companion.shipped import FLEET_FILE, SERVICE_FILE, write_shipped
 
 ROOT = Path(__file__).resolve().parents[2]
+TEXT = (ROOT / FLEET_FILE).read_text(encoding="utf-8")
 
 
 def test_what_is_written_is_what_is_shipped(tmp_path: Path) -> None:
-    written = write_shipped(tmp_path)
+    written = write_shipped(tmp_path, TEXT)
     assert [p.name for p in written] == [FLEET_FILE, SERVICE_FILE]
     assert (tmp_path / FLEET_FILE).read_bytes() == (ROOT / "fleet.toml").read_bytes()
     assert (tmp_path / SERVICE_FILE).read_bytes() == (ROOT / "deploy" / SERVICE_FILE).read_bytes()
@@ -25,14 +26,16 @@ def test_nothing_is_overwritten_and_then_nothing_is_written(tmp_path: Path) -> N
     mine = tmp_path / SERVICE_FILE
     mine.write_text("mine")
     with pytest.raises(ConfigError, match="is there already"):
-        write_shipped(tmp_path)
+        write_shipped(tmp_path, TEXT)
     assert mine.read_text() == "mine"
     assert not (tmp_path / FLEET_FILE).exists()
 
 
-def test_a_folder_that_is_none_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="is not a folder"):
-        write_shipped(tmp_path / "nowhere")
+def test_a_folder_is_made_and_a_file_in_its_place_is_refused(tmp_path: Path) -> None:
+    assert [p.exists() for p in write_shipped(tmp_path / "new" / "fleet", TEXT)] == [True, True]
+    (tmp_path / "taken").write_text("a file")
+    with pytest.raises(ConfigError, match=r"taken: cannot be written: File exists"):
+        write_shipped(tmp_path / "taken", TEXT)
 
 
 def test_a_built_wheel_brings_its_files_and_reads_them(tmp_path: Path) -> None:
