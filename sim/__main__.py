@@ -251,6 +251,34 @@ def check(
     tell(f"{existing_file(file)}: fit to fly")
 
 
+@app.command()
+def summary(
+    paths: Annotated[
+        list[Path], typer.Argument(help="Recordings (MCAP), or folders of them: a flight's, a vehicle's.")
+    ],
+    flight: Annotated[
+        int | None, typer.Option(min=1, help="Which take-off, counted from 1; left out: the last one recorded.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="The figures as JSON.")] = False,
+) -> None:
+    """Sum up a flight from its companions' recordings, whatever flew: stubs, SITL, or vehicles in the field.
+
+    Exit status: 0 the flight met its criteria, 1 it did not, 2 no recordings, damaged ones, or of different fleets.
+    """
+    from sim.launch.summary.recorded import recorded_flight
+    from sim.launch.summary.summarise import summarise
+    from sim.launch.view import show_summary
+
+    recorded, missing = recorded_flight(paths, flight)
+    # What companions refused is in their status, not in their recordings.
+    figures = {**summarise(recorded), "missing": missing, "takeoff_ns": recorded.takeoff_ns, "rejected": None}
+    if as_json:
+        typer.echo(json.dumps(figures))
+    else:
+        show_summary(figures)
+    raise typer.Exit(0 if figures["passed"] else FAILED)
+
+
 @app.command(hidden=True)
 def sitl(
     px4: Annotated[Path, typer.Option()],

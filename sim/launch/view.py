@@ -76,21 +76,24 @@ class FlightView:
 def show_summary(summary: Mapping[str, Any]) -> None:
     """The flight's figures and whether it met its criteria."""
     steady = summary["steady"]
+    known = summary["judged_by"] == "truth"
+    errors = steady if known else summary["believed"]
     table = Table(box=None, pad_edge=False, show_header=False)
     table.add_column()
     table.add_column()
     rows = [
         ("vehicles", summary["vehicles"]),
+        ("judged by", summary["judged_by"]),
         ("formed after", _unit(summary["formed_after_s"], "s")),
         (
             "its shape, its place after",
             f"{_unit(summary['shape_formed_after_s'], 's')}, {_unit(summary['place_taken_after_s'], 's')}",
         ),
-        ("minimum distance", _unit(summary["minimum_distance_m"], "m")),
-        ("formation error, rms", _unit(steady["formation_error_rms_m"], f"m over {steady['seconds']} s")),
+        ("minimum distance", _unit((summary if known else errors)["minimum_distance_m"], "m")),
+        ("formation error, rms", _unit(errors["formation_error_rms_m"], f"m over {steady['seconds']} s")),
         ("the same, estimates' errors unlike", _unit(summary["estimates"]["formation_error_decorrelated_rms_m"], "m")),
-        ("velocity error, rms", _unit(steady["velocity_error_rms_m_s"], "m/s")),
-        ("centroid from plan, rms", _unit(steady["centroid_error_rms_m"], "m")),
+        ("velocity error, rms", _unit(errors["velocity_error_rms_m_s"], "m/s")),
+        ("centroid from plan, rms", _unit(errors["centroid_error_rms_m"], "m")),
         ("messages a vehicle", _unit(steady["messages_per_vehicle_hz"], "/s")),
         ("fewer than at 20 Hz", _unit(steady["reduction_vs_20hz_percent"], "%")),
         (
@@ -115,7 +118,7 @@ def show_summary(summary: Mapping[str, Any]) -> None:
         ("lost companions", ", ".join(str(i) for i in summary["lost"]) or "none"),
         ("lost autopilots", _of_vehicles(summary["autopilots_lost"])),
         *(("commands" if k == 0 else "", _command(c)) for k, c in enumerate(summary["commands"])),
-        ("rejected", ", ".join(f"{k} {v}" for k, v in summary["rejected"].items()) or "none"),
+        ("rejected", _counts(summary["rejected"])),
         ("folder", summary.get("folder", "-")),
     ]
     for name, value in rows:
@@ -127,6 +130,12 @@ def show_summary(summary: Mapping[str, Any]) -> None:
             said = one_line(f"not met: {c['what']} {c['limit']}, got {c['value']}")
             console.print(Text(said, style="red"))
     console.print("passed" if summary["passed"] else "not passed", style="green" if summary["passed"] else "red")
+
+
+def _counts(counts: Mapping[str, int] | None) -> str:
+    if counts is None:
+        return "not known"
+    return ", ".join(f"{k} {v}" for k, v in counts.items()) or "none"
 
 
 def _of_vehicles(said: Mapping[int, str]) -> str:

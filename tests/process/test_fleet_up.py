@@ -278,6 +278,37 @@ def test_the_summary_has_every_operators_command_with_its_issuer_and_answers(flo
     assert summary["killed"] == summary["unrecorded"] == summary["autopilots_lost"] == {}
 
 
+def test_the_recordings_alone_give_the_same_summary(flown: Flown, tmp_path: Path) -> None:
+    told = json.loads(flown.out)
+    done = run("sim", "summary", str(flown.folder), "--json", folder=tmp_path)
+    read = json.loads(done.stdout)
+    assert done.returncode == flown.exit_status, done.stderr
+    assert (read["passed"], read["judged_by"], read["vehicles"]) == (told["passed"], "truth", 4)
+    # It counts from when the first vehicle had the take-off command, the launcher from when it asked.
+    later_s = (read["takeoff_ns"] - told["takeoff_ns"]) * 1e-9
+    assert 0.0 <= later_s < 5.0
+    assert read["formed_after_s"] == pytest.approx(told["formed_after_s"] - later_s, abs=1e-3)
+    for key in ("formation_error_rms_m", "centroid_error_rms_m", "messages_per_vehicle_hz"):
+        assert read["steady"][key] == pytest.approx(told["steady"][key], rel=0.02)
+    assert [c["id"] for c in read["commands"]] == [c["id"] for c in told["commands"]]
+    assert read["rejected"] is None
+
+
+def test_two_of_four_recordings_without_the_truth_are_judged_by_their_own_estimates(
+    flown: Flown, tmp_path: Path
+) -> None:
+    told = json.loads(flown.out)
+    done = run("sim", "summary", *(str(flown.folder / f"vehicle-{i}.mcap") for i in (1, 3)), "--json", folder=tmp_path)
+    assert done.returncode in (0, 1), done.stderr
+    read = json.loads(done.stdout)
+    assert (read["judged_by"], read["vehicles"]) == ("the vehicles' own estimates", 2)
+    assert sorted(read["missing"]) == ["2", "4"]
+    assert read["landed"] == {"1": True, "3": True}
+    assert read["formed_after_s"] == pytest.approx(told["formed_after_s"], abs=5.0)
+    assert 0.0 < read["believed"]["formation_error_rms_m"] < 2.0 * told["believed"]["formation_error_rms_m"] + 0.1
+    assert read["steady"]["formation_error_rms_m"] is None
+
+
 def test_every_companions_decisions_replay_byte_for_byte(flown: Flown) -> None:
     for i in flown.fleet.ids[1:]:
         result = replay_file(flown.folder / f"vehicle-{i}.mcap")

@@ -130,7 +130,7 @@ def test_the_summary_shows_who_commanded_what_and_who_was_killed(capsys: pytest.
             "loop_lateness_ms": none, "reference_lateness_ms": none, "cpu_per_tick_ms": None,
             "setpoint_gap_max_s": 0.1, "touchdown_max_m_s": 12.6, "killed": {3: "killed by command"}, "failsafes": [],
             "lost": [], "unrecorded": {}, "autopilots_lost": {2: "PX4 ended with status -9"}, "rejected": {},
-            "passed": False,
+            "passed": False, "judged_by": "truth",
             "commands": [
                 {
                     "at_s": 31.4, "verb": "kill", "issuer": "operator-ab12", "id": "1f", "accepted": [3],
