@@ -16,6 +16,7 @@ from companion.operator import verbs
 from companion.operator.verbs import FAILED, FLEET_TOML, FleetFile, OperatedFile, Vehicles
 from companion.terminal import tell, tolerate_any_encoding
 from sim.autopilot.faults import Fault, FaultKind
+from sim.report import commands as recorded
 from sim.study import FLOWN_STUDIES, STUDIES
 
 app = typer.Typer(help="A fleet of PX4 vehicles or of stubs: fly it, ask it, command it.", **COMMAND)
@@ -68,6 +69,7 @@ def up(
     allow_missing: Annotated[
         bool, typer.Option("--allow-missing", help="Fly without the vehicles that have not come after 15 s.")
     ] = False,
+    report: Annotated[bool, typer.Option(help="Write the flight's page, report.html; with --json none is.")] = True,
     as_json: Annotated[bool, typer.Option("--json", help="Only summary.json on standard output.")] = False,
 ) -> None:
     """Start stub autopilots and companions, take off, form, fly the plan, land, and sum up.
@@ -83,7 +85,8 @@ def up(
     from sim.launch.lock import only_flight, refuse_companions
     from sim.launch.px4_build import find_build
     from sim.launch.px4_instance import parse_parameters
-    from sim.launch.view import FlightView, show_summary
+    from sim.launch.summary.view import show_summary
+    from sim.launch.view import FlightView
 
     if autopilot not in ("stub", "px4", "external"):
         raise ConfigError(f"--autopilot must be stub, px4 or external, got {autopilot!r}")
@@ -143,6 +146,8 @@ def up(
         typer.echo(json.dumps(summary))
     else:
         show_summary(summary)
+        if report:
+            recorded.report([options.folder])
     raise typer.Exit(0 if summary["passed"] else FAILED)
 
 
@@ -251,34 +256,6 @@ def check(
     tell(f"{existing_file(file)}: fit to fly")
 
 
-@app.command()
-def summary(
-    paths: Annotated[
-        list[Path], typer.Argument(help="Recordings (MCAP), or folders of them: a flight's, a vehicle's.")
-    ],
-    flight: Annotated[
-        int | None, typer.Option(min=1, help="Which take-off, counted from 1; left out: the last one recorded.")
-    ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="The figures as JSON.")] = False,
-) -> None:
-    """Sum up a flight from its companions' recordings, whatever flew: stubs, SITL, or vehicles in the field.
-
-    Exit status: 0 the flight met its criteria, 1 it did not, 2 no recordings, damaged ones, or of different fleets.
-    """
-    from sim.launch.summary.recorded import recorded_flight
-    from sim.launch.summary.summarise import summarise
-    from sim.launch.view import show_summary
-
-    recorded, missing = recorded_flight(paths, flight)
-    # What companions refused is in their status, not in their recordings.
-    figures = {**summarise(recorded), "missing": missing, "takeoff_ns": recorded.takeoff_ns, "rejected": None}
-    if as_json:
-        typer.echo(json.dumps(figures))
-    else:
-        show_summary(figures)
-    raise typer.Exit(0 if figures["passed"] else FAILED)
-
-
 @app.command(hidden=True)
 def sitl(
     px4: Annotated[Path, typer.Option()],
@@ -374,6 +351,7 @@ def law_check(
     raise typer.Exit(0 if passed else FAILED)
 
 
+recorded.mount(app)
 verbs.mount(app)
 
 

@@ -18,8 +18,8 @@ from sim.launch.px4_build import HOW_TO_GET, build_version, find_build
 
 PYTHON_LEAST = (3, 11)
 FLIGHT = ("numpy", "pydantic", "typer", "fastcrc", "eclipse-zenoh")
-SIMULATION = ("pymavlink", "rich", "mcap")
-STUDIES = ("numba", "matplotlib", "scipy")
+SIMULATION = ("pymavlink", "rich", "mcap", "matplotlib")
+STUDIES = ("numba", "scipy")
 MODULES = {"eclipse-zenoh": "zenoh"}
 VEHICLES_PER_CORE = 8
 GROUND_PORT = 14550

@@ -44,7 +44,7 @@ def pyplot() -> Any:
         import matplotlib as mpl
     except ModuleNotFoundError as missing:
         raise ConfigError(
-            f"figures need {missing.name}, which is not installed: pip install 'starling-fleet[study]'"
+            f"figures need {missing.name}, which is not installed: pip install 'starling-fleet[sim]'"
         ) from missing
     mpl.use("Agg")
     from matplotlib import pyplot as plt

@@ -21,6 +21,7 @@ from math import nan
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import tomli_w
 import zenoh
@@ -65,6 +66,8 @@ from companion.wire.operator import Status
 from companion.wire.peer import encode_state
 from companion.wire.px4 import Px4Mode
 from sim.__main__ import main as fleet_main
+from sim.launch.summary.recorded import recorded_flight
+from sim.report.series import series_of
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(400)]
 
@@ -292,6 +295,26 @@ def test_the_recordings_alone_give_the_same_summary(flown: Flown, tmp_path: Path
         assert read["steady"][key] == pytest.approx(told["steady"][key], rel=0.02)
     assert [c["id"] for c in read["commands"]] == [c["id"] for c in told["commands"]]
     assert read["rejected"] is None
+
+
+def test_a_flights_page_draws_what_the_summary_says(flown: Flown, tmp_path: Path) -> None:
+    done = run("sim", "report", str(flown.folder), "--out", str(tmp_path / "page.html"), folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    page = (tmp_path / "page.html").read_text()
+    told = json.loads(flown.out)
+    assert ("passed" if told["passed"] else "not passed") in page
+    assert page.count("<svg") == page.count("<figure>") == 8
+    flight, _ = recorded_flight([flown.folder])
+    series = series_of(flight)
+    assert series.true
+    assert series.closest[0].least_m == pytest.approx(told["minimum_distance_m"], abs=0.1)
+    a, b = series.closest[0].ids
+    assert f"{a} and {b}: {series.closest[0].least_m:.2f} m at least" in page
+    sent = sum(len(times) for times in series.messages_s.values())
+    assert sent == sum(p.topic == "state" for p in flight.puts) > 4
+    began_s = (flight.takeoff_ns - told["takeoff_ns"]) * 1e-9
+    steady = series.times_s > told["formed_after_s"] - began_s + 3.0
+    assert np.nanmedian(series.formation_error_m[steady]) < 0.3
 
 
 def test_two_of_four_recordings_without_the_truth_are_judged_by_their_own_estimates(

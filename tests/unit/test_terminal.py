@@ -25,7 +25,8 @@ from companion.io.process import log_line
 from companion.operator import verbs
 from companion.terminal import LINE_MAX, TEXT_MAX, one_line, printable, tell
 from companion.wire.operator import Answer, Check, ClockReading, Place, Status, encode
-from sim.launch.view import FlightView, show_summary
+from sim.launch.summary.view import show_summary
+from sim.launch.view import FlightView
 from sim.launch.watch import Progress
 
 WORST = (
@@ -221,6 +222,7 @@ def test_the_summary_shows_no_control_characters(text: str) -> None:
         "estimates": estimates, "latency_ms": none, "loop_lateness_ms": none, "reference_lateness_ms": none,
         "killed": {1: text}, "failsafes": [text], "lost": [1], "unrecorded": {1: text}, "autopilots_lost": {1: text},
         "missing": {1: text}, "rejected": {text: 1}, "folder": text, "commands": [order], "passed": False,
+        "judged_by": text, "believed": {**steady, "minimum_distance_m": 1.0},
         "criteria": [{"what": text, "limit": text, "value": text, "met": False}],
     }  # fmt: skip
     said = shown(lambda: show_summary(summary))

@@ -14,7 +14,8 @@ from statuses import status
 from companion.errors import WireError
 from companion.operator.views import status_table
 from companion.wire.operator import Status, as_json, decode
-from sim.launch.view import FlightView, show_summary
+from sim.launch.summary.view import show_summary
+from sim.launch.view import FlightView
 from sim.launch.watch import Progress
 
 LONG = "its clock is 0.341 s behind that of vehicle 3, " * 12

@@ -22,7 +22,7 @@ def times_of(flight: Flight, ids: Sequence[int]) -> Array:
     return np.arange(begin, min(int(r["fleet_ns"][-1]) for r in rows), STEP_NS, dtype=np.int64)
 
 
-def _motion(flight: Flight, ids: Sequence[int], times: Array, axes: Sequence[str]) -> Array:
+def motion_of(flight: Flight, ids: Sequence[int], times: Array, axes: Sequence[str]) -> Array:
     """Positions or velocities as the companions have them, over (time, vehicle, axis)."""
     if not len(times):
         return np.zeros((0, len(ids), 3))
@@ -38,7 +38,7 @@ def believed_errors(
     """The same errors as the companions' own estimates have them."""
     times = times_of(flight, ids)
     times = times[steady_at(flight, history, times, formed) & (times >= window[0]) & (times <= window[1])]
-    motion = (_motion(flight, ids, times, axes) for axes in (POSITION, VELOCITY))
+    motion = (motion_of(flight, ids, times, axes) for axes in (POSITION, VELOCITY))
     return errors_from_slots(flight.config, history, ids, times, *motion)
 
 
@@ -56,7 +56,7 @@ def estimate_errors(
     times = times[steady_at(flight, history, times, formed) & (times >= window[0]) & (times <= window[1])]
     if not len(true_times) or len(times) < 2 * len(ids) or len(ids) < 2:
         return nothing
-    believed, velocity = (_motion(flight, ids, times, axes) for axes in (POSITION, VELOCITY))
+    believed, velocity = (motion_of(flight, ids, times, axes) for axes in (POSITION, VELOCITY))
     error = np.empty_like(believed)
     for k in range(len(ids)):
         for axis in range(3):
@@ -84,7 +84,7 @@ def _pair_correlation(error: Array) -> float | None:
 
 def minimum_distance_m(flight: Flight, ids: Sequence[int]) -> float | None:
     """Smallest distance of any pair from the take-off on, by their own estimates."""
-    p = _motion(flight, ids, times_of(flight, ids), POSITION)
+    p = motion_of(flight, ids, times_of(flight, ids), POSITION)
     i, j = np.triu_indices(len(ids), 1)
     distance = np.linalg.norm(p[:, i] - p[:, j], axis=2)
     return rounded(float(distance.min())) if distance.size else None

@@ -128,14 +128,16 @@ def errors_from_slots(
         },
         "altitude_error_max_m": rounded(float(np.max(altitude))),
         "lambda2_min": rounded(
-            min(_lambda2(config, history.at(int(times[k])), ids, position[k]) for k in range(0, len(times), step))
+            min(
+                connectivity_at(config, history.at(int(times[k])), ids, position[k]) for k in range(0, len(times), step)
+            )
         ),
         "windows": windows,
     }
 
 
-def _lambda2(config: FleetConfig, motion: FleetTrajectory, ids: Sequence[int], position: Array) -> float:
-    """Of the graph in use: of who heeds whom, by places or by slots."""
+def connectivity_at(config: FleetConfig, motion: FleetTrajectory, ids: Sequence[int], position: Array) -> float:
+    """lambda_2 of the graph in use: of who heeds whom, by places or by slots."""
     match config.neighbours:
         case "nearest":
             after = {i: change.after for i, change in motion.slots.items()}
