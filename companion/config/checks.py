@@ -142,15 +142,15 @@ def _host(vehicle: VehicleTable) -> str:
 
 def faults_on_one_computer(config: FleetConfig) -> list[str]:
     """What keeps all companions of a fleet from running on one computer: lines that several have."""
-    found, taken = [], dict[object, int]()
+    owners: dict[str, list[int]] = {}
     for v in config.vehicles:
-        first = taken.setdefault(_line(v.mavlink), v.id)
-        if first != v.id:
-            found.append(
-                f"vehicle {v.id}: mavlink = {v.mavlink!r} is vehicle {first}'s too, and one computer has one of it: "
-                "start `companion run --vehicle ID` on each vehicle's own"
-            )
-    return found
+        owners.setdefault(str(_line(v.mavlink)), []).append(v.id)
+    return [
+        f"vehicles {', '.join(map(str, ids))} have one line, mavlink = {config.by_id(ids[0]).mavlink!r}, and one "
+        "computer has one of it: start `companion run --vehicle ID` on each vehicle's own"
+        for ids in owners.values()
+        if len(ids) > 1
+    ]
 
 
 def _plan_faults(config: FleetConfig) -> Iterator[str]:

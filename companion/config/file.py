@@ -28,7 +28,7 @@ def load(path: Path, change: Callable[[dict[str, Any]], None] | None = None) -> 
 
 def read_tables(path: Path, change: Callable[[dict[str, Any]], None] | None = None) -> dict[str, Any]:
     """The raw tables of a TOML file, edited by `change`."""
-    tables = _tables(read_text(path), path)
+    tables = tables_of(read_text(path), path)
     if change is not None:
         change(tables)
     return tables
@@ -49,10 +49,11 @@ def read_text(path: Path) -> str:
 
 def parse_text(text: str, path: Path) -> FleetConfig:
     """Validate what the file `path` holds: for whoever keeps the text too, which is then the one that was validated."""
-    return parse(_tables(text, path), str(path))
+    return parse(tables_of(text, path), str(path))
 
 
-def _tables(text: str, path: Path) -> dict[str, Any]:
+def tables_of(text: str, path: Path) -> dict[str, Any]:
+    """The tables of a TOML text that a file holds; ConfigError if it is none."""
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

@@ -32,6 +32,8 @@ class ReplayResult:
     """control ticks among the inputs, as the recording counts them"""
     gap: Gap | None = None
     """where the recording has lost entries: nothing behind it can be compared"""
+    cut: bool = False
+    """whether the recording was not closed: its process was killed, or the file is not whole"""
 
     @property
     def same(self) -> bool:
@@ -43,7 +45,8 @@ class ReplayResult:
         head = f"{self.inputs} inputs, {self.outputs} outputs compared byte for byte"
         if self.gap is not None:
             return f"{head}: the same; {self.gap.sentence()}, so nothing behind them can be compared"
-        return f"{head}: the same" if self.same else f"{head}: first difference: {self.difference}"
+        whole = "; the recording was not closed: its process was killed, or the file is cut short" if self.cut else ""
+        return f"{head}: the same{whole}" if self.same else f"{head}: first difference: {self.difference}"
 
 
 def replay_file(path: Path) -> ReplayResult:
@@ -51,7 +54,7 @@ def replay_file(path: Path) -> ReplayResult:
     recording = read_recording(path)
     recording.verify()
     agent = _agent(recording)
-    result = replay(agent, recording.entries, recording.complete)
+    result = replace(replay(agent, recording.entries, recording.complete), cut=not recording.complete)
     if result.same and (behind := list(recording.gaps())):
         return replace(result, gap=behind[-1])
     return result

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 
-from companion.errors import CompanionError
+from companion.errors import CompanionError, ConfigError
 from companion.vehicle.autopilot.px4_versions import NEWEST, VERSIONS, Px4Version, fleet_parameters
 
 PLACES = (
@@ -30,7 +30,7 @@ def find_build(given: Path | None) -> Path:
     said, build = (f"PX4_BUILD={named}", Path(named)) if given is None and named else (f"--px4 {given}", given)
     if build is not None:
         if not _is_build(build):
-            raise CompanionError(f"{said}: is no PX4 build folder (needs bin/px4 and etc/). {HOW_TO_GET}")
+            raise ConfigError(f"{said}: is no PX4 build folder (needs bin/px4 and etc/). {HOW_TO_GET}")
         return build.resolve()
     places = [Path(place).expanduser() for place in PLACES]
     found = next((place for place in places if _is_build(place)), None)

@@ -100,7 +100,7 @@ def flight_of(config: Config) -> Flight:
     flight = table_of(config, "flight", Flight)
     if unknown := sorted(set(flight.kinds) - set(EXPLAINED)):
         raise ConfigError(
-            f"{config.name}.toml: $.flight.kinds: there is no {', '.join(unknown)}; known are {', '.join(EXPLAINED)}"
+            f"{config.where}: $.flight.kinds: there is no {', '.join(unknown)}; known are {', '.join(EXPLAINED)}"
         )
     return flight
 

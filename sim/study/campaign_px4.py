@@ -80,7 +80,7 @@ def with_build(config: Config, build: Path) -> Config:
     text = (
         f'{config.text}\n[px4]\nbuild = {json.dumps(str(build))}\nlike = {json.dumps(version)}\ndigest = "{digest}"\n'
     )
-    return Config(config.name, text, tomllib.loads(text))
+    return Config(config.name, text, tomllib.loads(text), config.file)
 
 
 def build_of(config: Config) -> Path:
@@ -93,7 +93,7 @@ def flight_of(config: Config, build: Path) -> Flight:
     flight = table_of(config, "flight", Flight)
     if unknown := sorted(set(flight.kinds) - set(KINDS)):
         raise ConfigError(
-            f"{config.name}.toml: $.flight.kinds: there is no {', '.join(unknown)}; known are {', '.join(KINDS)}"
+            f"{config.where}: $.flight.kinds: there is no {', '.join(unknown)}; known are {', '.join(KINDS)}"
         )
     suffers = kinds_of(lambda name: has_parameter(build, name))
     wanted = flight.kinds or KINDS

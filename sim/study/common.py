@@ -6,7 +6,6 @@ import inspect
 import json
 import math
 import os
-import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field, replace
@@ -20,10 +19,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy.stats import beta
 
+from companion.config.file import read_text, tables_of
 from companion.config.law_tables import LAWS
 from companion.config.registry import Origin
 from companion.errors import ConfigError
 from sim.study import FLOWN, FLOWN_STUDIES, STUDIES
+from sim.study.own_setup import same_tables
 from sim.swarm.setup import Setup, connected, setup_from
 from sim.swarm.swarm import Run, kernels
 
@@ -95,29 +96,36 @@ class Config:
     name: str
     text: str
     values: Mapping[str, Any]
+    file: str = ""
+    """the user's own; empty: the shipped one"""
+
+    @property
+    def where(self) -> str:
+        """The file, for messages."""
+        return self.file or f"{self.name}.toml"
 
     @property
     def base(self) -> Setup:
         """The set-up that every case starts from."""
-        return setup_from(self.values.get("base", {}), f"{self.name}.toml: $.base")
+        return setup_from(self.values.get("base", {}), f"{self.where}: $.base")
 
     def cases(self, table: str = "cases") -> dict[str, Setup]:
         """Named set-ups of one table, each on top of the base."""
         return {
-            name: setup_from(given, f"{self.name}.toml: $.{table}.{name}", self.base)
+            name: setup_from(given, f"{self.where}: $.{table}.{name}", self.base)
             for name, given in self.values.get(table, {}).items()
         }
 
     def on(self, setup: Setup, table: str) -> dict[str, Setup]:
         """Named changes of one table, each on top of `setup`."""
         return {
-            name: setup_from(given, f"{self.name}.toml: $.{table}.{name}", setup)
+            name: setup_from(given, f"{self.where}: $.{table}.{name}", setup)
             for name, given in self.values.get(table, {}).items()
         }
 
     def one(self, table: str) -> Setup:
         """The base changed by one table of the file."""
-        return setup_from(self.values[table], f"{self.name}.toml: $.{table}", self.base)
+        return setup_from(self.values[table], f"{self.where}: $.{table}", self.base)
 
     @property
     def published(self) -> Mapping[str, Any]:
@@ -134,27 +142,26 @@ def table_of(config: Config, name: str, kind: type[T]) -> T:
     known = set(inspect.signature(kind).parameters)
     if set(given) != known:
         wrong = ", ".join(sorted(set(given) ^ known))
-        raise ConfigError(f"{config.name}.toml: $.{name} must have the keys {', '.join(sorted(known))}; wrong: {wrong}")
+        raise ConfigError(f"{config.where}: $.{name} must have the keys {', '.join(sorted(known))}; wrong: {wrong}")
     return kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in given.items()})
 
 
 def load_config(name: str, path: Path | None = None) -> Config:
     """The set-up beside the study's code, or the user's own in `path`."""
-    path = path or Path(__file__).with_name(f"{name}.toml")
-    try:
-        text = path.read_text(encoding="utf-8")
-        values = tomllib.loads(text)
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror}); give an existing TOML file") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: is not TOML: {error}") from error
-    config = Config(name, text, values)
+    shipped = Path(__file__).with_name(f"{name}.toml")
+    text = read_text(path or shipped)
+    values = tables_of(text, path or shipped)
+    config = Config(name, text, values, "" if path is None else str(path))
+    if not isinstance(config.values.get("base", {}), dict) or not isinstance(config.values.get("cases", {}), dict):
+        raise ConfigError(f"{config.where}: $.base and $.cases must be tables")
     for setup in [config.base, *config.cases().values()]:
         if not connected(setup.formation.slots(), setup.range_m):
             raise ConfigError(
-                f"{path.name}: the formation is not connected at range_m = {setup.range_m:g} m: "
+                f"{config.where}: the formation is not connected at range_m = {setup.range_m:g} m: "
                 "raise range_m or bring the slots closer together"
             )
+    if path is not None:
+        same_tables(values, tables_of(read_text(shipped), shipped), path, shipped)
     return config
 
 
@@ -219,9 +226,8 @@ def foreign_laws(values: Any) -> list[Origin]:
     return sorted(found)
 
 
-def _piece(name: str, text: str, seed: int) -> Record:
-    config = Config(name, text, tomllib.loads(text))
-    return dict(study_module(name).piece(config, seed))
+def _piece(config: Config, seed: int) -> Record:
+    return dict(study_module(config.name).piece(config, seed))
 
 
 def pieces(config: Config, seeds: Sequence[int], out: Path, jobs: int, advance: Callable[[], None]) -> list[Record]:
@@ -237,13 +243,13 @@ def pieces(config: Config, seeds: Sequence[int], out: Path, jobs: int, advance: 
             advance()
     missing = [seed for seed in seeds if seed not in done]
     if jobs <= 1 or len(missing) <= 1:
-        results: Iterable[Record] = (_piece(config.name, config.text, seed) for seed in missing)
+        results: Iterable[Record] = (_piece(config, seed) for seed in missing)
         for seed, record in zip(missing, results, strict=True):
             done[seed] = _keep(paths[seed], record)
             advance()
     else:
         with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-            waiting = {pool.submit(_piece, config.name, config.text, seed): seed for seed in missing}
+            waiting = {pool.submit(_piece, config, seed): seed for seed in missing}
             try:
                 for future in as_completed(waiting):
                     seed = waiting[future]

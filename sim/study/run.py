@@ -17,6 +17,7 @@ from sim.study.common import (
     writable_folder,
     write_outcome,
 )  # fmt: skip
+from sim.study.own_setup import flown_as
 from sim.study.report import write_report
 from sim.swarm.swarm import kernels
 
@@ -63,8 +64,9 @@ def study(
             module = study_module(config.name)
             used = tuple(module.seeds_used(chosen)) if hasattr(module, "seeds_used") else chosen
             task = bar.add_task(config.name, total=len(used))
-            results = pieces(config, used, folder, jobs, lambda task=task: bar.advance(task))  # type: ignore[misc]
-            outcome: Outcome = module.finish(config, results, used)
+            with flown_as(setup, config.name):
+                results = pieces(config, used, folder, jobs, lambda task=task: bar.advance(task))  # type: ignore[misc]
+                outcome: Outcome = module.finish(config, results, used)
             write_outcome(config, outcome, used, folder)
             done.append((config, outcome))
     report = write_report(folder, name, done, seeds=chosen)

@@ -59,11 +59,11 @@ def about_of(config: Config) -> dict[str, About]:
     """What each scenario of the set-up is judged by; every one must say it."""
     given, cases = config.values.get("about", {}), config.cases()
     if set(given) != set(cases):
-        raise ConfigError(f"{config.name}.toml: $.about must name the scenarios of $.cases: {', '.join(cases)}")
+        raise ConfigError(f"{config.where}: $.about must name the scenarios of $.cases: {', '.join(cases)}")
     try:
         return {k: _about(given[k]) for k in cases}
     except TypeError as error:
-        raise ConfigError(f"{config.name}.toml: $.about: {error}") from error
+        raise ConfigError(f"{config.where}: $.about: {error}") from error
 
 
 def _about(given: Record) -> About:

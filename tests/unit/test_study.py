@@ -210,7 +210,7 @@ def test_a_study_that_cannot_be_run_is_refused_with_a_sentence(
         ("[base.formation]\ncount = 1\n", "formation.count must be at least 2"),
         ("[base]\nrange_m = 0.5\n", "not connected at range_m"),
         ("[base]\nspeed = 3\n", "is not a setting"),
-        ("[base\n", "is not TOML"),
+        ("[base\n", "is not valid TOML"),
     ],
 )
 def test_a_users_own_setup_is_checked(tmp_path: Path, text: str, says: str) -> None:
