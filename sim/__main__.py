@@ -141,7 +141,7 @@ def up(
             allow_missing, logs=logs,
         )  # fmt: skip
         with FlightView(quiet=as_json) as view:
-            summary = fly(tables, options, view.show, interrupted, lambda line: tell(line, error=True))
+            summary = fly(tables, options, view.show_progress, interrupted, lambda line: tell(line, error=True))
     if as_json:
         typer.echo(json.dumps(summary))
     else:

@@ -105,12 +105,20 @@ def status(
     fleet: OperatedFile = None,
     vehicles: Vehicles = None,
     as_json: Annotated[bool, typer.Option("--json", help="Each vehicle's own account as JSON.")] = False,
+    watched: Annotated[bool, typer.Option("--watch", help="Once a second, until Ctrl-C.")] = False,
 ) -> None:
     """Each vehicle's account of itself: phase, slot error, neighbours, battery, failsafes.
 
-    Exit status 1 if one is silent or cannot be read.
+    Exit status 1 if one is silent or cannot be read; 0 where it was watched.
     """
+    if watched and as_json:
+        raise ConfigError("status needs --watch or --json, got both")
     with connected(fleet, vehicles) as operator:
+        if watched:
+            from companion.operator.live import watch
+
+            watch(operator.status, operator.config.fleet.name)
+            return
         statuses = operator.status()
     roster = operator.roster
     if as_json:

@@ -35,6 +35,7 @@ from sim.launch.lock import only_flight
 from sim.launch.px4_build import build_version, find_build, has_parameter
 from sim.launch.sitl_faults import kinds_of
 from sim.launch.summary.flight import Flight as FlightRecord
+from sim.launch.summary.truth import ALOFT_M
 from sim.launch.watch import Progress
 from sim.study.campaign import campaign_tables
 from sim.study.campaign_faults import HANDED_OVER, Drawn, Flight, drawn_faults
@@ -51,6 +52,7 @@ CALM_AFTER_S = 4.0
 LANDING_S = 20.0
 """the operator waits no longer for those who are somebody else's"""
 STALLED_MOST_S = 3.0
+AT_REST_M_S = 0.05
 FIRST_INSTANCE, INSTANCES_APART = 40, 10
 """beside whatever else flies on this machine"""
 SLOTS = 8
@@ -154,15 +156,32 @@ class _Eye:
     def _unsettled(self, progress: Progress) -> list[list[Any]]:
         """Who is neither on the ground nor handed over, by truth and by the companion's phase."""
         newest = _newest(self.truth)
-        stuck: list[list[Any]] = []
-        for i in self.ids:
-            status, row = progress.vehicles.get(i), newest.get(i)
-            landed = row is None or (not row["armed"] and row["landed_state"] == ON_GROUND)
-            steered = status is not None and Phase[status.phase.upper()] in FLYING_PHASES | {Phase.PREFLIGHT}
-            handed_over = row is not None and not steered and int(row["custom_mode"]) in HANDED_OVER
-            if not landed and not handed_over:
-                stuck.append([i, "no answer" if status is None else status.phase])
-        return stuck
+        phases = {i: None if (s := progress.vehicles.get(i)) is None else Phase[s.phase.upper()] for i in self.ids}
+        return [
+            [i, "no answer" if phase is None else phase.name.lower()]
+            for i, phase in phases.items()
+            if not settled(newest.get(i), phase)
+        ]
+
+
+def settled(row: Any, phase: Phase | None) -> bool:
+    """Whether a flight is over for a vehicle: on the ground and disarmed, or in somebody else's hands.
+
+    `row` is its last of truth (None: nobody tells), `phase` its companion's (None: that does not answer).
+    """
+    if row is None or (not row["armed"] and row["landed_state"] == ON_GROUND):
+        return True
+    if phase is not None and phase in FLYING_PHASES | {Phase.PREFLIGHT}:
+        return False
+    return int(row["custom_mode"]) in HANDED_OVER or _lies(row)
+
+
+def _lies(row: Any) -> bool:
+    """Whether a vehicle is at rest on the ground by truth.
+
+    A PX4 that does not know where it is does not always notice, and stays armed in its landing.
+    """
+    return bool(row["position_ned_m"][2] > -ALOFT_M and np.abs(row["velocity_ned_m_s"]).max() < AT_REST_M_S)
 
 
 def _newest(path: Path) -> dict[int, Any]:

@@ -134,6 +134,8 @@ class Flown:
     after_garbage: dict[int, Status | None] = field(default_factory=dict)
     unnamed: subprocess.CompletedProcess[str] = field(default_factory=lambda: subprocess.CompletedProcess([], -1))
     """`status` without --fleet, from another folder whose file has no more than the fleet's name"""
+    watched: tuple[int, str, str] = (-1, "", "")
+    """exit status and outputs of `status --watch`, ended by Ctrl-C"""
     status_of_five: tuple[int, dict[int, Status | None]] = (-1, {})
 
     def say(self, verb: str, *arguments: str) -> None:
@@ -216,6 +218,10 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
         elsewhere.mkdir()
         (elsewhere / "fleet.toml").write_text(f'[fleet]\nname = "{fleet.config.fleet.name}"\n')
         flown.unnamed = run("sim", "status", folder=elsewhere)
+        with started("sim", "status", "--watch", folder=elsewhere, name="watch") as watching:
+            assert eventually(lambda: watching.out.count("\n") >= 2, 30.0)
+            watching.signal(signal.SIGINT)
+            flown.watched = (watching.wait(), watching.out, watching.err)
         flown.say("land")
         flown.exit_status = up.wait()
         flown.out, flown.err = up.out, up.err
@@ -362,6 +368,15 @@ def test_a_verb_without_a_file_reaches_the_flight_of_the_name_that_its_folders_f
     assert flown.unnamed.returncode == 0, flown.unnamed.stderr
     first_words = [line.split()[0] for line in flown.unnamed.stdout.splitlines() if line.strip()]
     assert [word for word in first_words if word.isdigit()] == ["1", "2", "3", "4"]
+
+
+def test_a_watched_fleet_is_told_line_by_line_without_a_terminal_until_ctrl_c(flown: Flown) -> None:
+    exit_status, out, err = flown.watched
+    assert (exit_status, err) == (0, "")
+    name = flown.fleet.config.fleet.name
+    assert all(name in line and "4 holding" in line and "nearest pair" in line for line in out.splitlines())
+    times_s = [float(line.split()[0]) for line in out.splitlines()]
+    assert times_s[1] - times_s[0] >= 4.0
 
 
 def test_a_vehicle_that_is_not_there_is_named_as_silent(flown: Flown) -> None:

@@ -16,7 +16,7 @@ from sim.autopilot.stubs import TRUTH_DTYPE
 from sim.launch.faults import CompanionFault, CompanionFaultKind
 from sim.study.campaign_faults import EXPLAINED, Drawn, Flight, drawn_faults
 from sim.study.campaign_judge import judged, tables_of
-from sim.study.campaign_px4 import KINDS, STALLED_MOST_S, flight_of, scheduled, seen_of, with_build
+from sim.study.campaign_px4 import KINDS, STALLED_MOST_S, flight_of, scheduled, seen_of, settled, with_build
 from sim.study.common import Config, load_config
 
 SECOND_NS = 1_000_000_000
@@ -121,6 +121,43 @@ def test_the_fence_is_for_whoever_flies_on_setpoints(tmp_path: Path) -> None:
     assert judged(seen_of(out, [1, 2], [], T0), [], flight)["beyond_fence_m"] < 0.0
     out["custom_mode"], out["landed_state"] = int(Px4Mode.OFFBOARD), ON_GROUND
     assert judged(seen_of(out, [1, 2], [], T0), [], flight)["beyond_fence_m"] < 0.0
+
+
+LANDING, ALOFT = 4, 2
+
+
+@pytest.mark.parametrize(
+    ("armed", "landed", "mode", "down_m", "speed_m_s", "phase", "over"),
+    [
+        (0, ON_GROUND, Px4Mode.AUTO_LAND, 0.0, 0.0, Phase.LANDED, True),
+        (0, ON_GROUND, Px4Mode.OFFBOARD, 0.0, 0.0, None, True),
+        (1, ALOFT, Px4Mode.OFFBOARD, -3.0, 1.0, Phase.MOVING, False),
+        (1, ALOFT, Px4Mode.AUTO_LOITER, -3.0, 0.0, Phase.MOVING, False),
+        (1, ALOFT, Px4Mode.AUTO_LOITER, -3.0, 0.0, Phase.RELEASED, True),
+        (1, ALOFT, Px4Mode.AUTO_LOITER, -3.0, 0.0, None, True),
+        (1, ALOFT, Px4Mode.POSCTL, -3.0, 0.0, Phase.RELEASED, True),
+        (1, LANDING, Px4Mode.AUTO_LAND, -3.0, 0.7, Phase.RELEASED, False),
+        # a PX4 whose estimate has run away lies on the ground and stays armed
+        (1, LANDING, Px4Mode.AUTO_LAND, 5.1, 0.0, Phase.RELEASED, True),
+        (1, LANDING, Px4Mode.AUTO_LAND, -0.29, 0.04, Phase.RELEASED, True),
+        (1, LANDING, Px4Mode.AUTO_LAND, -0.31, 0.04, Phase.RELEASED, False),
+        (1, LANDING, Px4Mode.AUTO_LAND, -0.29, 0.06, Phase.RELEASED, False),
+        (1, LANDING, Px4Mode.AUTO_LAND, 0.0, 0.0, None, True),
+        (1, ALOFT, Px4Mode.OFFBOARD, 0.0, 0.0, Phase.MOVING, False),
+    ],
+)
+def test_a_flight_is_over_for_who_is_down_or_in_somebody_elses_hands(
+    armed: int, landed: int, mode: Px4Mode, down_m: float, speed_m_s: float, phase: Phase | None, over: bool
+) -> None:
+    row = np.zeros((), TRUTH_DTYPE)
+    row["armed"], row["landed_state"], row["custom_mode"] = armed, landed, mode
+    row["position_ned_m"], row["velocity_ned_m_s"] = (300.0, 100.0, down_m), (0.0, speed_m_s, 0.0)
+    assert settled(row, phase) is over
+
+
+def test_who_tells_nothing_is_over() -> None:
+    assert settled(None, None)
+    assert settled(None, Phase.MOVING)
 
 
 def test_a_campaign_with_one_broken_flight_says_so_with_an_interval(tmp_path: Path) -> None:

@@ -172,7 +172,7 @@ def test_the_view_of_a_flight_shows_no_control_characters(text: str, word: str) 
 
     def show() -> None:
         with FlightView(quiet=False) as view:
-            view.show(progress)
+            view.show_progress(progress)
 
     said = shown(show)
     assert "flying" in said
@@ -186,7 +186,7 @@ def test_the_live_view_shows_no_control_characters_of_others(said: str, monkeypa
     vehicles: dict[int, Status | None] = {1: status(phase=said[:64], failsafes=[said], killed=said), 2: None}
     err = io.StringIO()
     with redirect_stderr(err), FlightView(quiet=False) as view:
-        view.show(Progress(1.0, "flying", vehicles, {2: -9}, {1: said}))
+        view.show_progress(Progress(1.0, "flying", vehicles, {2: -9}, {1: said}))
     ours = re.compile(r"\x1b\[[0-9;]*m|\x1b\[\?25[hl]|\x1b\[[0-9]*[A-H]|\x1b\[2K|\r")
     assert all(c.isprintable() or c == "\n" for c in ours.sub("", err.getvalue()))
 

@@ -154,7 +154,7 @@ def test_without_a_terminal_a_vehicle_that_is_killed_is_told_at_once_and_once(
     flying, killed = status(phase="moving"), status(phase="released", killed="killed by command")
     with FlightView(quiet=False) as view:
         for elapsed_s, second in ((0.0, flying), (1.0, killed), (2.0, killed)):
-            view.show(Progress(elapsed_s, "flying", {1: flying, 2: second}, {}))
+            view.show_progress(Progress(elapsed_s, "flying", {1: flying, 2: second}, {}))
     told = capsys.readouterr().err.splitlines()
     assert [("vehicle 2: killed by command" in line, "1 killed" in line) for line in told] == [
         (False, False),
