@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
+from companion.errors import ConfigError
 from companion.terminal import tell
 
 FAILED = 1
@@ -19,10 +20,15 @@ WhichFlight = Annotated[
 ]
 
 
+log_app = typer.Typer(no_args_is_help=True, help="Recordings: what they hold, and as tables for other tools.")
+
+
 def mount(app: typer.Typer) -> None:
     """Add them to a command."""
     app.command()(summary)
     app.command()(report)
+    app.command()(compare)
+    app.add_typer(log_app, name="log")
 
 
 def _read(paths: list[Path], number: int | None) -> tuple[Any, dict[str, Any]]:
@@ -71,3 +77,47 @@ def report(
     file = out or (paths[0] if paths[0].is_dir() else paths[0].parent) / PAGE
     write_page(recorded, figures, file)
     tell(f"report: {file}")
+
+
+def compare(
+    paths: Annotated[list[Path], typer.Argument(help="Two or more flights: a folder, or a recording, of each.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Each flight's figures as JSON.")] = False,
+) -> None:
+    """Set the figures of flights side by side, the last take-off of each.
+
+    Exit status: 0 shown, 2 no recordings, or fewer than two flights.
+    """
+    from sim.launch.summary.view import show_side_by_side
+
+    if len(paths) < 2:
+        raise ConfigError(f"compare needs two flights or more, got {len(paths)}")
+    figures = [_read([path], None)[1] for path in paths]
+    if as_json:
+        typer.echo(json.dumps({str(path): one for path, one in zip(paths, figures, strict=True)}))
+    else:
+        show_side_by_side([str(path) for path in paths], figures)
+
+
+@log_app.command("info")
+def log_info(paths: Recordings) -> None:
+    """What each recording holds: vehicle, time, entries of each channel, what is missing."""
+    from sim.launch.summary.recorded import recordings_of
+    from sim.report.export import info
+
+    for path in recordings_of(paths):
+        for what, value in info(path):
+            tell(f"{what:18}  {value}")
+
+
+@log_app.command("export")
+def log_export(
+    paths: Recordings,
+    out: Annotated[Path, typer.Option(help="Folder for ticks.csv, messages.csv and events.csv.")],
+    flight: WhichFlight = None,
+) -> None:
+    """Write a flight's ticks, messages and events as CSV, one row each, times since take-off and UTC."""
+    from sim.report.export import write_tables
+
+    recorded, _ = _read(paths, flight)
+    for path in write_tables(recorded, out):
+        tell(f"written: {path}")

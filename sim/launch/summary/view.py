@@ -1,6 +1,6 @@
 """A flight's summary as a person reads it."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rich.console import Console
@@ -24,6 +24,19 @@ def show_summary(summary: Mapping[str, Any]) -> None:
             said = one_line(f"not met: {c['what']} {c['limit']}, got {c['value']}")
             console.print(Text(said, style="red"))
     console.print("passed" if summary["passed"] else "not passed", style="green" if summary["passed"] else "red")
+
+
+def show_side_by_side(names: Sequence[str], summaries: Sequence[Mapping[str, Any]]) -> None:
+    """The figures of several flights, a column each; what commands there were is each flight's own."""
+    table = Table(box=None, pad_edge=False)
+    table.add_column("")
+    for name in names:
+        table.add_column(one_line(name), overflow="fold")
+    columns = [dict(row for row in summary_rows(s) if row[0] not in ("", "commands", "folder")) for s in summaries]
+    for name in columns[0]:
+        table.add_row(name, *(Text(one_line(str(column[name]), LINE_MAX)) for column in columns))
+    table.add_row("", *(Text("passed" if s["passed"] else "not passed") for s in summaries))
+    Console().print(table)
 
 
 def summary_rows(summary: Mapping[str, Any]) -> list[tuple[str, Any]]:
@@ -53,7 +66,8 @@ def summary_rows(summary: Mapping[str, Any]) -> list[tuple[str, Any]]:
         ),
         (
             "payload, wire a vehicle",
-            f"{steady['payload_bytes_per_vehicle_s']}, {steady['wire_bytes_per_vehicle_s']} B/s",
+            f"{_unit(steady['payload_bytes_per_vehicle_s'], 'B/s')}, "
+            f"{_unit(steady['wire_bytes_per_vehicle_s'], 'B/s')}",
         ),
         ("sensor to setpoint p50, p99", _pair(summary["latency_ms"])),
         ("loop lateness p50, p99", _pair(summary["loop_lateness_ms"])),
@@ -69,7 +83,7 @@ def summary_rows(summary: Mapping[str, Any]) -> list[tuple[str, Any]]:
         ("lost autopilots", _of_vehicles(summary["autopilots_lost"])),
         *(("commands" if k == 0 else "", _command(c)) for k, c in enumerate(summary["commands"])),
         ("rejected", _counts(summary["rejected"])),
-        ("folder", summary.get("folder", "-")),
+        *([("folder", summary["folder"])] if "folder" in summary else []),
     ]
 
 
