@@ -131,15 +131,32 @@ def px4_params(
 @app.command()
 def replay(
     file: Annotated[Path, typer.Argument(help="A companion's recording (MCAP).")],
+    config: Annotated[
+        Path | None, typer.Option(help="Another fleet file: what would its law, trigger and limits have said?")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="With --config: the differences as JSON.")] = False,
 ) -> None:
     """Run the agent on a recording's inputs and compare its outputs byte for byte.
 
+    With --config an agent of other settings sees the same inputs, and the differences are summed up: messages by cause,
+    setpoints, failsafes. The vehicle flew by its own settings: this compares decisions and predicts no flight.
     Needs the extra replay. Exit status: 0 the same, 1 different, or entries are missing (the first is shown), 2 no
     recording, or a damaged one.
     """
+    if as_json and config is None:
+        raise ConfigError("replay --json belongs to --config FILE")
     with libraries_of("replay"):
         from companion.io.replay import replay_file
+        from companion.io.what_if import replay_with
 
+    if config is not None:
+        compared = replay_with(file, config)
+        if as_json:
+            typer.echo(compared.as_json())
+        else:
+            for line in compared.sentences():
+                tell(line)
+        return
     began_s = process_time()
     result = replay_file(file)
     spent_s = process_time() - began_s

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from companion.config import FleetConfig
 from companion.config.file import parse
 from companion.core.failsafe import Failsafe
 from companion.core.values import Instant
@@ -60,22 +61,35 @@ def replay_file(path: Path) -> ReplayResult:
     return result
 
 
-def _agent(recording: Recording) -> Agent:
-    """An agent made from what the recorded one was made from."""
+def made_from(recording: Recording) -> tuple[FleetConfig, int, int]:
+    """The configuration, vehicle id and boot id of the recorded agent; RecordingError if the recording lacks them."""
     facts, path = recording.metadata, recording.path
     try:
-        config = parse(tomllib.loads(facts["config"]), path.name)
-        flown, here = facts.get("foreign", "[]"), json.dumps([o._asdict() for o in config.foreign])
-        if json.loads(flown) != json.loads(here):
-            raise ValueError(f"it was flown with {flown}, and installed is {here}")
+        config = parse(tomllib.loads(facts["config"]), str(path))
         vehicle_id, boot_id = int(facts["vehicle_id"]), int(facts["boot_id"])
+        config.by_id(vehicle_id)
         if boot_id not in BOOT_IDS:
             raise ValueError(f"boot id {boot_id}")
-        return Agent(config, vehicle_id, boot_id)
     except KeyError as missing:
         raise RecordingError(path, f"is no companion's recording: {missing} is missing") from None
     except (ValueError, RecursionError, CompanionError) as error:
         raise RecordingError(path, f"is no companion's recording: {error}") from None
+    return config, vehicle_id, boot_id
+
+
+def _agent(recording: Recording) -> Agent:
+    """An agent made from what the recorded one was made from."""
+    config, vehicle_id, boot_id = made_from(recording)
+    flown, here = recording.metadata.get("foreign", "[]"), json.dumps([o._asdict() for o in config.foreign])
+    try:
+        same = json.loads(flown) == json.loads(here)
+    except (ValueError, RecursionError) as error:
+        raise RecordingError(recording.path, f"is no companion's recording: {error}") from None
+    if not same:
+        raise RecordingError(
+            recording.path, f"is no companion's recording: it was flown with {flown}, and installed is {here}"
+        )
+    return Agent(config, vehicle_id, boot_id)
 
 
 def replay(agent: Agent, entries: Iterable[Entry], complete: bool = True) -> ReplayResult:
@@ -124,6 +138,16 @@ def replay(agent: Agent, entries: Iterable[Entry], complete: bool = True) -> Rep
         channel, body = expected[0]
         return ReplayResult(inputs, outputs, f"at the end: replayed {channel} {body.hex()}, recorded nothing", ticks)
     return ReplayResult(inputs, outputs, None, ticks)
+
+
+def feed(guard: Guard, entry: Entry, path: Path) -> None:
+    """Give an agent a recorded input; what it answers is dropped. RecordingError for a damaged entry of the file."""
+    try:
+        for _ in INPUTS[entry.channel](guard, entry.body, entry.instant):
+            pass
+    except Exception as error:
+        said = f"{_at(entry)}: {entry.channel} cannot be read: {type(error).__name__}: {error}"
+        raise RecordingError(path, said) from error
 
 
 def _at(entry: Entry) -> str:

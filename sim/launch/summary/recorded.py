@@ -1,6 +1,5 @@
 """A flight read from its companions' recordings alone, whatever flew: stubs, SITL, vehicles in the field."""
 
-import tomllib
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
@@ -10,11 +9,11 @@ import numpy as np
 
 from companion.about import PACKAGE
 from companion.config import FleetConfig
-from companion.config.file import parse
 from companion.core.events import MotionAdopted, PhaseChanged
 from companion.core.values import Phase
-from companion.errors import CompanionError, ConfigError
-from companion.io.recording import Recording, RecordingError, read_recording
+from companion.errors import ConfigError
+from companion.io.recording import Recording, read_recording
+from companion.io.replay import made_from
 from sim.autopilot.stubs import TRUTH_DTYPE
 from sim.launch.reference_loop import read_reference_loop
 from sim.launch.summary.flight import TICK_ROWS, TRAFFIC_ROWS, Array, Flight
@@ -49,7 +48,7 @@ def recorded_flight(paths: Sequence[Path], number: int | None = None) -> tuple[F
     software: set[str] = set()
     for path in recordings_of(paths):
         recording = read_recording(path)
-        config, vehicle_id = _made_from(recording)
+        config, vehicle_id, _ = made_from(recording)
         _same_fleet(configs, path, config)
         first = next(iter(recording.entries), None)
         if first is not None:
@@ -72,18 +71,6 @@ def recorded_flight(paths: Sequence[Path], number: int | None = None) -> tuple[F
         if path.is_dir() and (file := path / "reference.bin").exists():
             flight.reference_lateness_ns = read_reference_loop(file)[:, 1].astype(float)
     return _cut(flight, number), missing
-
-
-def _made_from(recording: Recording) -> tuple[FleetConfig, int]:
-    try:
-        config = parse(tomllib.loads(recording.metadata["config"]), str(recording.path))
-        vehicle_id = int(recording.metadata["vehicle_id"])
-        config.by_id(vehicle_id)
-    except KeyError as missing:
-        raise RecordingError(recording.path, f"is no companion's recording: {missing} is missing") from None
-    except (ValueError, CompanionError) as error:
-        raise RecordingError(recording.path, f"is no companion's recording: {error}") from None
-    return config, vehicle_id
 
 
 def _same_fleet(configs: list[tuple[Path, FleetConfig]], path: Path, config: FleetConfig) -> None:
