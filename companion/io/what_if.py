@@ -80,8 +80,8 @@ class Compared:
             f"differs in {', '.join(self.keys) or 'nothing that vehicles must agree on'}",
             f"state messages in {self.seconds:.1f} s: {_counted(self.own.messages)} as recorded, "
             f"{_counted(self.other.messages)} with the other file",
-            f"setpoints: {d['setpoints_own']} and {d['setpoints_other']}; in the {d['setpoints_alike']} ticks with both "
-            f"in one phase of one motion velocity differs by {d['velocity_rms_m_s']:.3f} m/s RMS, "
+            f"setpoints: {d['setpoints_own']} and {d['setpoints_other']}; in the {d['setpoints_alike']} ticks with "
+            f"both in one phase of one motion velocity differs by {d['velocity_rms_m_s']:.3f} m/s RMS, "
             f"{d['velocity_max_m_s']:.3f} at most, acceleration by {d['acceleration_rms_m_s2']:.3f} m/s^2 RMS, "
             f"{d['acceleration_max_m_s2']:.3f} at most",
             f"failsafes: {'; '.join(self.own.failsafes) or 'none'} as recorded, "
