@@ -32,6 +32,7 @@ class Failsafe(Enum):
     POSITION_JUMPED = "own position jumped"
     POSITION_JUMPS = "own position goes on jumping"
     COVARIANCE = "own position uncertain"
+    NOT_FOLLOWED = "setpoints not followed"
     HEARTBEAT = "autopilot's heartbeat lost"
     PILOT = "OFFBOARD left by the pilot"
     AUTOPILOT = "OFFBOARD left by the autopilot's failsafe"
@@ -97,6 +98,10 @@ UNCERTAIN_S = 2.0
 """ESTIMATOR_STATUS comes once a second: two in a row"""
 ACCURACY_LIMIT_M = 3.0
 """PX4's own limit for arming (EKF2_REQ_EPH); flags alone stay up for seconds after the position sensor's end"""
+NOT_FOLLOWED_S = 2.0
+NOT_FOLLOWED_M_S, NOT_FOLLOWED_SHARE = 2.0, 0.5
+"""level difference of the own velocity from the one asked for, and its share of `limits.speed_max_m_s`: the larger
+counts. In flights on PX4 the difference is below 1.3 m/s, steps of wind included"""
 STATUS_S = 5.0
 """ESTIMATOR_STATUS or SYS_STATUS, which come once a second, older than this: what it said is unknown"""
 BATTERY_S = 3.0
@@ -143,6 +148,12 @@ FAILSAFES: dict[Failsafe, Row] = {
         "2 s of ESTIMATOR_STATUS with flags missing, an accuracy worse than 3 m or not above 0, or none for 5 s; "
         "at once when the origin has crept 1 m, by less than 0.5 m each time", UNCERTAIN_S,
         Action.LAND, "the estimate may drift towards the others", _NOT,
+    ),
+    Failsafe.NOT_FOLLOWED: Row(
+        "2 s at more than 2 m/s (half of `limits.speed_max_m_s` if more) from the level velocity asked for",
+        NOT_FOLLOWED_S, Action.LAND,
+        "the estimate runs away (a GPS that is stuck), an actuator has failed, or a wind is stronger than the vehicle",
+        _NOT,
     ),
     Failsafe.HEARTBEAT: Row("3 s", HEARTBEAT_S, Action.HAND_OVER, "released", _BY_COMMAND),
     Failsafe.PILOT: Row(

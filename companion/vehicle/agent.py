@@ -9,7 +9,7 @@ the part that does it: `observer`, `supervisor`, `peers`, `plans`, `publisher`, 
 
 from collections.abc import Sequence
 from dataclasses import replace
-from math import dist
+from math import dist, hypot
 from random import Random
 from typing import Any
 
@@ -241,6 +241,7 @@ class Agent:
         dt_s = self._begin(now)
         measured = self.supervisor.state(now)
         self._supervise(measured is not None, now)
+        self.supervisor.flight.unfollowed_m_s = 0.0
         if measured is None:
             self._publish_last_known(now)
             return
@@ -259,6 +260,11 @@ class Agent:
             residual = wanted.residual_ned_m
             setpoint = self._constrain(wanted.command(reference), ego, neighbours, dt_s)
             self._steer(setpoint)
+            if setpoint is not None:
+                self.supervisor.flight.unfollowed_m_s = hypot(
+                    ego.velocity_ned_m_s.north - setpoint.velocity_north_m_s,
+                    ego.velocity_ned_m_s.east - setpoint.velocity_east_m_s,
+                )
             self.publisher.see_near(self.safety.peer_planes, neighbours, reference.velocity_ned_m_s, now)
         self.supervisor.settle(ego, reference, now)
         self.graph.look(plan, ego.position_ned_m, neighbours, part, now)

@@ -53,6 +53,9 @@ class Flight:
     """of the autopilot, when it was last engaged"""
     isolated_since_ns: int | None = None
     """since when nobody else is heard, in formation or detached"""
+    unfollowed_m_s: float = 0.0
+    """level difference of the velocity asked for at the last tick and the own, of which positions tell too
+    (`observer`); 0 where nothing was asked. The agent writes it."""
     stands_since_ns: int | None = None
     """since when it stands detached; None: it does not, or is on its way back. The follower writes it."""
 

@@ -22,7 +22,7 @@ _NO_POSITION = {_F.POSITION_LOST, _F.POSITION_JUMPED, _F.AUTOPILOT, _F.NOT_ARMED
 EXPLAINED: dict[str, frozenset[Failsafe]] = {
     kind: OF_THE_FLEET | own
     for kind, own in {
-        "gps_lost": _NO_POSITION | {_F.POSITION_JUMPS, _F.COVARIANCE},
+        "gps_lost": _NO_POSITION | {_F.POSITION_JUMPS, _F.COVARIANCE, _F.NOT_FOLLOWED},
         "position_frozen": _NO_POSITION | {_F.PILOT},
         "estimator_reset": {_F.POSITION_JUMPED},
         "noise": {_F.POSITION_JUMPED, _F.POSITION_JUMPS},
@@ -42,10 +42,10 @@ EXPLAINED: dict[str, frozenset[Failsafe]] = {
         "second_companion": set(),
         "forged_plan": set(),
         "forged_digest": set(),
-        "gps_stuck": _NO_POSITION | {_F.POSITION_JUMPS, _F.COVARIANCE},
-        "gps_wrong": _NO_POSITION | {_F.POSITION_JUMPS, _F.COVARIANCE},
+        "gps_stuck": _NO_POSITION | {_F.POSITION_JUMPS, _F.COVARIANCE, _F.NOT_FOLLOWED},
+        "gps_wrong": _NO_POSITION | {_F.POSITION_JUMPS, _F.COVARIANCE, _F.NOT_FOLLOWED},
         "link_lost": _NO_POSITION | {_F.HEARTBEAT, _F.PILOT},
-        "wind": set(),
+        "wind": {_F.NOT_FOLLOWED},
         "battery_empty": {_F.BATTERY_LOW, _F.BATTERY_CRITICAL, _F.NOT_ARMED, _F.AUTOPILOT},
         "px4_restarted": _NO_POSITION | {_F.HEARTBEAT, _F.PILOT},
     }.items()

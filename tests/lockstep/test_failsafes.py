@@ -241,6 +241,17 @@ def covariance() -> tuple[float, float]:
     return s.noted(Failsafe.COVARIANCE), 2.0
 
 
+def not_followed() -> tuple[float, float]:
+    def in_the_open(tables: dict[str, Any]) -> None:
+        tables.setdefault("stub", {})["drag_per_s"] = 1.0
+
+    s = scene(change=in_the_open)
+    s.inject(FaultKind.WIND, wind_ned_m_s=Ned(0.0, 25.0, 0.0))  # pushes with 25 m/s^2
+    must_end(s, Phase.LANDING, within_s=5.0)
+    must_end(s, Phase.LANDED)
+    return s.noted(Failsafe.NOT_FOLLOWED), 2.5
+
+
 def heartbeat() -> tuple[float, float]:
     s = scene()
     s.silence(0, lambda autopilot: autopilot.heartbeat_ns)
@@ -556,7 +567,8 @@ def not_finite() -> tuple[float, float]:
 SCENARIOS: dict[Failsafe, Callable[[], tuple[float, float]]] = {
     Failsafe.POSITION_STALE: position_stale, Failsafe.POSITION_FROZEN: position_frozen,
     Failsafe.POSITION_LOST: position_lost, Failsafe.POSITION_JUMPED: position_jumped,
-    Failsafe.POSITION_JUMPS: position_jumps, Failsafe.COVARIANCE: covariance, Failsafe.HEARTBEAT: heartbeat,
+    Failsafe.POSITION_JUMPS: position_jumps, Failsafe.COVARIANCE: covariance,
+    Failsafe.NOT_FOLLOWED: not_followed, Failsafe.HEARTBEAT: heartbeat,
     Failsafe.PILOT: pilot, Failsafe.AUTOPILOT: autopilot, Failsafe.NOT_ARMED: not_armed,
     Failsafe.NO_TAKE_OFF: no_take_off, Failsafe.ALTITUDE: altitude, Failsafe.MISSING: missing, Failsafe.ALONE: alone,
     Failsafe.ALONE_FOR_LONG: alone_for_long, Failsafe.DETACHED_FOR_LONG: apart_for_long, Failsafe.PEER_GONE: peer_gone,
@@ -586,7 +598,8 @@ def test_each_failsafe_is_noticed_in_time_and_does_what_the_table_says(failsafe:
 def test_actions_are_what_the_scenarios_check() -> None:
     landing = {f for f, row in FAILSAFES.items() if row.action is Action.LAND}
     assert landing == {
-        Failsafe.POSITION_JUMPS, Failsafe.COVARIANCE, Failsafe.NO_TAKE_OFF, Failsafe.ALTITUDE, Failsafe.MISSING,
+        Failsafe.POSITION_JUMPS, Failsafe.COVARIANCE, Failsafe.NOT_FOLLOWED, Failsafe.NO_TAKE_OFF, Failsafe.ALTITUDE,
+        Failsafe.MISSING,
         Failsafe.ALONE_FOR_LONG, Failsafe.DETACHED_FOR_LONG, Failsafe.BATTERY_CRITICAL, Failsafe.STOPPED,
     }  # fmt: skip
     assert {f for f, row in FAILSAFES.items() if row.action is Action.RETURN} == {Failsafe.BATTERY_LOW}

@@ -11,6 +11,7 @@ from companion.core.failsafe import (
     HEARTBEAT_S,
     JUMPS_S,
     LOST_S,
+    NOT_FOLLOWED_S,
     TAKE_OFF_S,
     UNCERTAIN_S,
     Action,
@@ -28,6 +29,7 @@ from companion.vehicle.detectors.autopilot import (
     LeftByPilot,
     NoTakeOff,
     NotArmed,
+    NotFollowed,
 )
 from companion.vehicle.detectors.battery import BatteryCritical, BatteryLow, BatteryUnknown
 from companion.vehicle.detectors.peers import Alone, AloneForLong, Deaf, DetachedForLong, OthersMissing
@@ -72,6 +74,29 @@ def test_a_detector_that_is_not_asked_on_the_ground_finds_nothing_in_a_quiet_fli
             said(one).lives(now)
             one.observe(now, positioned=True)
             assert detector.look(one, now) is None
+
+
+# -- what was asked for ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("speed_max_m_s", "limit_m_s"), [(1.0, 2.0), (4.0, 2.0), (10.0, 5.0)])
+def test_setpoints_are_not_followed_beyond_the_limit_for_its_time(speed_max_m_s: float, limit_m_s: float) -> None:
+    limits = CONFIG.limits.model_copy(update={"speed_max_m_s": speed_max_m_s})
+    one = flight(Phase.MOVING, armed=True, mode=OFFBOARD, on_ground=False)
+    one.config = CONFIG.model_copy(update={"limits": limits})
+    for off_m_s, acts in ((0.0, False), (limit_m_s, False), (limit_m_s + JUST, True), (100.0, True)):
+        one.unfollowed_m_s = off_m_s
+        assert found_after(NotFollowed(), one, NOT_FOLLOWED_S) is acts
+
+
+def test_a_tick_that_is_followed_or_asks_for_nothing_begins_the_time_anew() -> None:
+    one, detector = flight(Phase.MOVING, armed=True, mode=OFFBOARD, on_ground=False), NotFollowed()
+    for second in range(10):
+        one.unfollowed_m_s = 9.0
+        assert looks(detector, one, second) is None
+        assert looks(detector, one, second + 0.9) is None
+        one.unfollowed_m_s = 0.0
+        assert looks(detector, one, second + 0.95) is None
 
 
 # -- the autopilot -----------------------------------------------------------------------------------------------------

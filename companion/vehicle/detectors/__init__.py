@@ -14,6 +14,7 @@ DETECTORS: tuple[type[Detector], ...] = (
     position.PositionUncertain,
     position.PositionJumpsOn,
     position.PositionJumped,
+    autopilot.NotFollowed,
     battery.BatteryCritical,
     battery.BatteryLow,
     autopilot.NotArmed,

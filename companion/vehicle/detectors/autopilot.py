@@ -2,7 +2,16 @@
 
 from typing import ClassVar
 
-from companion.core.failsafe import CLIMB_S, FROZEN_S, HEARTBEAT_S, TAKE_OFF_S, Failsafe
+from companion.core.failsafe import (
+    CLIMB_S,
+    FROZEN_S,
+    HEARTBEAT_S,
+    NOT_FOLLOWED_M_S,
+    NOT_FOLLOWED_S,
+    NOT_FOLLOWED_SHARE,
+    TAKE_OFF_S,
+    Failsafe,
+)  # fmt: skip
 from companion.core.health import Debounce
 from companion.core.values import FILTERED_PHASES, FLYING_PHASES, Instant, Phase
 from companion.vehicle.autopilot.port import HOLD, LAND, OFFBOARD, TAKE_OFF, Verb
@@ -72,6 +81,22 @@ def mode_is_foreign(flight: Flight) -> bool:
             # On disarming PX4 falls back to the mode before, which the heartbeat tells a second later.
             return mode not in (LAND, OFFBOARD, before) and not flight.autopilot.on_ground
     return mode not in (*ON_THE_WAY_UP, LAND, before)
+
+
+class NotFollowed(Detector):
+    """The vehicle flies elsewhere than it is told to, or its positions and its velocities tell different things."""
+
+    failsafe = Failsafe.NOT_FOLLOWED
+    phases = FILTERED_PHASES
+    needs_position = True
+
+    def __init__(self) -> None:
+        self._unfollowed = Debounce(NOT_FOLLOWED_S)
+
+    def look(self, flight: Flight, now: Instant) -> Finding | None:
+        off_m_s = flight.unfollowed_m_s
+        followed = off_m_s <= max(NOT_FOLLOWED_M_S, NOT_FOLLOWED_SHARE * flight.config.limits.speed_max_m_s)
+        return Finding(f"{off_m_s:.1f} m/s off") if self._unfollowed.holds(not followed, now.monotonic_ns) else None
 
 
 class NotArmed(Detector):
