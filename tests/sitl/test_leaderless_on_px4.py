@@ -1,7 +1,6 @@
 """Five real PX4 without a shared motion: two are informed, the others follow by what their neighbours tell."""
 
 import json
-import signal
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -54,9 +53,9 @@ def test_five_follow_the_two_that_are_informed_through_a_turn(
         for verb in ("hold", "land"):
             answer = run("sim", verb, "--fleet", str(flight.fleet.file), folder=tmp_path)
             assert answer.returncode == 0, answer.stderr
-            flight.wait("holding" if verb == "hold" else "landed")
-        if flight.up.popen.poll() is None:
-            flight.up.signal(signal.SIGINT)
+            if verb == "hold":
+                flight.wait("holding")
+        # The launcher ends with the last landing; whoever asks then finds nobody.
         flight.up.wait(120.0)
     summary: dict[str, Any] = json.loads(flight.up.out)
     off_m_s = np.linalg.norm(velocity - np.array([0.0, 1.0]), axis=1)
