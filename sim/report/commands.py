@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from companion.errors import ConfigError
+from companion.errors import CompanionError, ConfigError
 from companion.terminal import tell
 
 FAILED = 1
@@ -77,6 +77,14 @@ def report(
     file = out or (paths[0] if paths[0].is_dir() else paths[0].parent) / PAGE
     write_page(recorded, figures, file)
     tell(f"report: {file}")
+
+
+def report_if_it_can(folder: Path) -> None:
+    """The page of a flight that has just ended; that it cannot be drawn is told, and is no fault of the flight."""
+    try:
+        report([folder])
+    except CompanionError as error:
+        tell(f"no report: {error}", error=True)
 
 
 def compare(

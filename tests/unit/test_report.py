@@ -12,6 +12,7 @@ from companion.errors import CompanionError
 from sim.launch.summary.flight import Flight
 from sim.launch.summary.recorded import recorded_flight
 from sim.launch.summary.summarise import summarise
+from sim.report.commands import report_if_it_can
 from sim.report.page import page, write_page
 from sim.report.series import HEARTBEAT_SHARE, Pair, series_of
 
@@ -110,3 +111,11 @@ def test_a_pair_that_never_was_known_is_the_last_of_the_closest() -> None:
     assert Pair((1, 2), np.array([np.nan, 3.0, 2.0])).least_m == 2.0
     assert Pair((1, 2), np.array([np.nan, np.nan])).least_m == np.inf
     assert Pair((1, 2), np.zeros(0)).least_m == np.inf
+
+
+def test_a_flight_that_cannot_be_drawn_is_told_and_is_no_fault_of_the_flight(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    report_if_it_can(tmp_path)
+    assert capsys.readouterr().err == f"no report: {tmp_path}: no recording (*.mcap) is in this folder\n"
+    assert list(tmp_path.iterdir()) == []
