@@ -9,6 +9,8 @@
     endpoints   addresses and ports of links
     messages    a fault of one value as a sentence
     file        reads and validates a file
+    new_file    the text of a new one
+    overrides   what a command line may change of one
 
 Every key has a range and a unit (its suffix); an unknown key is refused. Names of units: `_m` metres, `_s` seconds,
 `_m_s` metres per second, `_deg` degrees.
