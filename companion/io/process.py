@@ -34,10 +34,22 @@ def fly_vehicle(
     key = signing_key or config.by_id(vehicle_id).signing_key_beside(file)
     settings = RunSettings(vehicle_id, record, stop_fd, log, key, file)
     companion = Companion(config, settings, {"config": text, "version": product_version()})
+    if stop_fd is None:
+        log(_started(config, vehicle_id, record))
     try:
         return run_in_process(companion)
     finally:
         companion.close()
+
+
+def _started(config: FleetConfig, vehicle_id: int, record: Path | None) -> str:
+    """What somebody who started it by hand, or reads the journal, wants to know first."""
+    one = config.by_id(vehicle_id)
+    where = "" if one.zenoh is None else f" at {one.zenoh}"
+    return (
+        f"started: waits for its autopilot on {one.mavlink}, for its peers of fleet {config.fleet.name} on the "
+        f"{config.peers.network} network{where}; {'records nothing' if record is None else f'records into {record}'}"
+    )
 
 
 def log_line(vehicle_id: int, note: str) -> bytes:

@@ -52,6 +52,10 @@ def test_the_watchdog_is_fed_while_the_loop_turns_and_not_while_it_is_stopped(
             started(*arguments, folder=tmp_path, name="companion") as companion,
         ):
             await_word(manager, "READY=1")
+            # The journal's first line tells what it is, and what it waits for.
+            name_of_fleet, line = fleet.config.fleet.name, fleet.config.by_id(1).mavlink
+            assert companion.out.startswith(f"vehicle 1: started: waits for its autopilot on {line}, for its peers of ")
+            assert f"fleet {name_of_fleet} on the laptop network; records nothing" in companion.out.splitlines()[0]
             await_word(manager, "WATCHDOG=1")
             await_word(manager, "WATCHDOG=1")
             companion.signal(signal.SIGSTOP)
