@@ -1,5 +1,6 @@
 """Command `companion`: one vehicle's companion process."""
 
+import json
 import sys
 from pathlib import Path
 from time import process_time
@@ -152,7 +153,7 @@ def replay(
     if config is not None:
         compared = replay_with(file, config)
         if as_json:
-            typer.echo(compared.as_json())
+            typer.echo(json.dumps(compared.as_json()))
         else:
             for line in compared.sentences():
                 tell(line)

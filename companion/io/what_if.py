@@ -4,12 +4,11 @@ Both agents see what the recorded vehicle saw: it flew by its own settings, and 
 So this compares decisions, tick by tick, and predicts no flight.
 """
 
-import json
 from collections import Counter
 from dataclasses import dataclass, field
 from math import dist, sqrt
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from companion.config.file import load
 from companion.core.events import FailsafeActed
@@ -91,13 +90,13 @@ class Compared:
             said.append(f"the other file's agent raised {_counted(self.other.raised)}")
         return said
 
-    def as_json(self) -> str:
-        """The same for programs."""
+    def as_json(self) -> dict[str, Any]:
+        """The same for programs, as JSON has it."""
         sides = {
             name: {"messages": dict(a.messages), "failsafes": a.failsafes, "raised": dict(a.raised)}
             for name, a in (("recorded", self.own), ("other", self.other))
         }
-        return json.dumps({"keys": self.keys, "seconds": self.seconds, **sides, "setpoints": self.differences()})
+        return {"keys": self.keys, "seconds": self.seconds, **sides, "setpoints": self.differences()}
 
 
 def _rms(values: list[float]) -> float:
