@@ -1,5 +1,6 @@
 """The table of a fleet as it goes on: redrawn on a terminal, a line every few seconds elsewhere."""
 
+import signal
 import time
 from collections.abc import Callable, Sequence
 from types import TracebackType
@@ -14,6 +15,7 @@ from companion.terminal import one_line, printable
 
 PLAIN_INTERVAL_S = 5.0
 ASKED_EVERY_S = 1.0
+STOPPED_WITHIN_S = 0.1
 
 
 class LiveTable:
@@ -69,12 +71,15 @@ def _nearest(vehicles: Vehicles) -> str:
 
 
 def watch(ask: Callable[[], Vehicles], name: str) -> None:
-    """Show what `ask` returns of a fleet of that name, once a second, until interrupted."""
+    """Show what `ask` returns of a fleet of that name, once a second, until SIGINT or SIGTERM. Main thread only."""
+    came: list[int] = []
+    # Whoever is started in the background ignores SIGINT, unless it says otherwise.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda n, _: came.append(n))
     began_s = time.monotonic()
     with LiveTable() as table:
-        try:
-            while True:
-                table.show(ask(), time.monotonic() - began_s, name)
-                time.sleep(ASKED_EVERY_S)
-        except KeyboardInterrupt:
-            return
+        while not came:
+            asked_s = time.monotonic()
+            table.show(ask(), asked_s - began_s, name)
+            while not came and time.monotonic() < asked_s + ASKED_EVERY_S:
+                time.sleep(STOPPED_WITHIN_S)
