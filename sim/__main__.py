@@ -2,9 +2,7 @@
 
 import json
 import os
-import signal
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,6 +10,7 @@ import typer
 
 from companion.about import COMMAND, with_version
 from companion.errors import CompanionError, ConfigError, MissingLibraryError, libraries_of
+from companion.interrupts import interrupts
 from companion.operator import verbs
 from companion.operator.verbs import FAILED, FLEET_TOML, FleetFile, OperatedFile, Vehicles
 from companion.terminal import tell, tolerate_any_encoding
@@ -76,7 +75,7 @@ def up(
 
     Ctrl-C lands the fleet. Exit status: 0 the flight met its criteria, 1 it did not, 2 wrong usage or configuration.
     """
-    from companion.config.checks import faults_on_one_computer
+    from companion.config.checks import refuse_shared_lines
     from companion.config.file import parse
     from companion.config.overrides import existing_file, fleet_tables, on_this_computer, plan_legs
     from sim.autopilot.stub_fleet import check_stub_links
@@ -90,6 +89,8 @@ def up(
 
     if autopilot not in ("stub", "px4", "external"):
         raise ConfigError(f"--autopilot must be stub, px4 or external, got {autopilot!r}")
+    if rehearse and autopilot == "external":
+        raise ConfigError("--rehearse is for stubs and SITL: vehicles that run already are no rehearsal")
     if px4 is not None and autopilot != "px4":
         raise ConfigError(f"--px4 needs --autopilot px4, got --autopilot {autopilot}")
     parse_parameters(parameter or ())
@@ -111,21 +112,21 @@ def up(
             if value is not None and isinstance(tables.setdefault(table, {}), dict):
                 tables[table][key] = value
 
-    tables = fleet_tables(fleet, vehicles, change)
+    file = existing_file(fleet)
+    tables = fleet_tables(file, vehicles, change)
     for row in tables.get("vehicle", ()):
         if isinstance(row, dict) and isinstance(row.get("signing_key"), str):
             # The flight's own copy of the file lies elsewhere.
-            row["signing_key"] = str((existing_file(fleet).parent / row["signing_key"]).resolve())
+            row["signing_key"] = str((file.parent / row["signing_key"]).resolve())
     if calm:
         tables.setdefault("stub", {}).update(
             position_noise_m=0.0, velocity_noise_m_s=0.0, gust_m_s2=0.0, wind_north_m_s=0.0, wind_east_m_s=0.0
         )
-    config = parse(tables, str(existing_file(fleet)))
+    config = parse(tables, str(file))
     if len(config.vehicles) > CROWD_PER_CORE * len(os.sched_getaffinity(0)):
         tables.setdefault("limits", {}).setdefault("control_rate_hz", CROWD_RATE_HZ)
-        config = parse(tables, str(existing_file(fleet)))
-    if shared := faults_on_one_computer(config):
-        raise ConfigError("\n".join((*shared, "--rehearse flies such a file on one computer")))
+        config = parse(tables, str(file))
+    refuse_shared_lines(config)
     if autopilot == "stub":
         check_stub_links(config)
     elif gcs:
@@ -133,30 +134,25 @@ def up(
     elif scenario is not None and autopilot == "external":
         raise ConfigError("--scenario is for --autopilot stub or px4: nobody here can harm what runs elsewhere")
     faults = () if scenario is None else load_scenario(scenario, config)
-    interrupted = _interrupts()
+    interrupted = interrupts()
     with only_flight(config.fleet.name):
         refuse_companions(config)
         options = FlightOptions(
             flight_folder(out), seed, duration, px4, tuple(parameter or ()), autopilot == "external", gcs, faults,
             allow_missing, logs=logs,
         )  # fmt: skip
+        if rehearse:
+            where = options.folder / "fleet.toml"
+            tell(f"rehearsed as fleet {config.fleet.name}: verbs reach it with --fleet {where}", error=True)
         with FlightView(quiet=as_json) as view:
-            summary = fly(tables, options, view.show_progress, interrupted, lambda line: tell(line, error=True))
+            flown = fly(tables, options, view.show_progress, interrupted, lambda line: tell(line, error=True))
     if as_json:
-        typer.echo(json.dumps(summary))
+        typer.echo(json.dumps(flown.summary))
     else:
-        show_summary(summary)
+        show_summary(flown.summary)
         if report:
-            recorded.report_if_it_can(options.folder)
-    raise typer.Exit(0 if summary["passed"] else FAILED)
-
-
-def _interrupts() -> Callable[[], bool]:
-    """Whether SIGINT or SIGTERM came; the launcher lands its fleet then instead of dying."""
-    came: list[int] = []
-    for s in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(s, lambda number, _: came.append(number))
-    return lambda: bool(came)
+            recorded.draw(*flown, options.folder)
+    raise typer.Exit(0 if flown.summary["passed"] else FAILED)
 
 
 @app.command()
@@ -176,11 +172,13 @@ def stub(
 
     A vehicle's own `mavlink` URL moves both: the stub sends to that port, from 40 above it (1000 from the eleventh on).
     """
+    from companion.config.checks import refuse_shared_lines
     from companion.config.overrides import fleet_config
     from sim.autopilot.stub_fleet import check_stub_links, stub_settings
     from sim.autopilot.stubs import run_stubs
 
     config = fleet_config(fleet, vehicles)
+    refuse_shared_lines(config)
     check_stub_links(config)
     if not launched:
         for v in config.vehicles:

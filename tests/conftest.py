@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-FLEETS = ("test_fleet_up.py", "test_missing.py")
+FLEETS = ("test_companions.py", "test_fleet_losses.py", "test_fleet_up.py", "test_missing.py")
 """files of tests/process that fly whole fleets: half of the time of all"""
 TOGETHER = (
     "test_flight.py",

@@ -140,17 +140,20 @@ def _host(vehicle: VehicleTable) -> str:
     return "" if host in LOOPBACK else host
 
 
-def faults_on_one_computer(config: FleetConfig) -> list[str]:
-    """What keeps all companions of a fleet from running on one computer: lines that several have."""
-    owners: dict[str, list[int]] = {}
+def refuse_shared_lines(config: FleetConfig) -> None:
+    """Raise ConfigError if the companions of a fleet cannot all run on one computer, for several have one line."""
+    owners: dict[int | str | None, list[int]] = {}
     for v in config.vehicles:
-        owners.setdefault(str(_line(v.mavlink)), []).append(v.id)
-    return [
-        f"vehicles {', '.join(map(str, ids))} have one line, mavlink = {config.by_id(ids[0]).mavlink!r}, and one "
-        "computer has one of it: start `companion run --vehicle ID` on each vehicle's own"
-        for ids in owners.values()
-        if len(ids) > 1
-    ]
+        owners.setdefault(_line(v.mavlink), []).append(v.id)
+    if shared := [ids for ids in owners.values() if len(ids) > 1]:
+        raise ConfigError(
+            "\n".join(
+                f"vehicles {', '.join(map(str, ids))} have one line, mavlink = {config.by_id(ids[0]).mavlink!r}, and "
+                "one computer has one of it: start `companion run --vehicle ID` on each vehicle's own, or rehearse the "
+                "file on this one by `fleet up --rehearse`"
+                for ids in shared
+            )
+        )
 
 
 def _plan_faults(config: FleetConfig) -> Iterator[str]:

@@ -18,6 +18,9 @@ LEG_KEYS = {
     "turn": ("rate_deg_s", "angle_deg"),
     "goto": ("north_m", "east_m", "speed_m_s"),
 }
+REHEARSAL = "-rehearsal"
+NAME_MOST = 32
+"""letters of a fleet's name"""
 OPTIONAL_LEG_KEYS = frozenset({"angle_deg", "speed_m_s"})
 
 
@@ -58,8 +61,12 @@ def resize(tables: dict[str, Any], count: int) -> None:
 def on_this_computer(tables: dict[str, Any]) -> None:
     """Give every vehicle this computer's lines and network instead of its own: a hardware file, rehearsed.
 
-    Nobody holds a transmitter here, so none is demanded.
+    Nobody holds a transmitter here, so none is demanded. The fleet has a name of its own: no verb that is meant for the
+    vehicles reaches the rehearsal, nor the other way round.
     """
+    fleet = tables.get("fleet")
+    if isinstance(fleet, dict) and isinstance(fleet.get("name"), str):
+        fleet["name"] = f"{fleet['name'][: NAME_MOST - len(REHEARSAL)]}{REHEARSAL}"
     preflight = tables.setdefault("preflight", {})
     if isinstance(preflight, dict):
         preflight["require_rc"] = False

@@ -54,7 +54,7 @@ def replay_file(path: Path) -> ReplayResult:
     """Replay one recording; RecordingError if the file is none, or is damaged."""
     recording = read_recording(path)
     recording.verify()
-    agent = _agent(recording)
+    agent = recorded_agent(recording)
     result = replace(replay(agent, recording.entries, recording.complete), cut=not recording.complete)
     if result.same and (behind := list(recording.gaps())):
         return replace(result, gap=behind[-1])
@@ -77,7 +77,7 @@ def made_from(recording: Recording) -> tuple[FleetConfig, int, int]:
     return config, vehicle_id, boot_id
 
 
-def _agent(recording: Recording) -> Agent:
+def recorded_agent(recording: Recording) -> Agent:
     """An agent made from what the recorded one was made from."""
     config, vehicle_id, boot_id = made_from(recording)
     flown, here = recording.metadata.get("foreign", "[]"), json.dumps([o._asdict() for o in config.foreign])

@@ -14,7 +14,7 @@ from companion.config.file import load
 from companion.core.events import FailsafeActed
 from companion.errors import ConfigError
 from companion.io.recording import Recording, read_recording
-from companion.io.replay import INPUTS, feed, made_from
+from companion.io.replay import INPUTS, feed, made_from, recorded_agent
 from companion.vehicle.agent import Agent
 from companion.vehicle.guard import Guard
 from companion.wire.mavlink import SET_POSITION_TARGET_LOCAL_NED
@@ -119,7 +119,8 @@ def replay_with(path: Path, other_file: Path) -> Compared:
     other = load(other_file)
     if vehicle_id not in [v.id for v in other.vehicles]:
         raise ConfigError(f"{other_file}: has no enabled vehicle {vehicle_id}, which {path} is the recording of")
-    (own, others), seconds = _run(recording, [Agent(c, vehicle_id, boot_id) for c in (config, other)])
+    agents = [recorded_agent(recording), Agent(other, vehicle_id, boot_id)]
+    (own, others), seconds = _run(recording, agents)
     return Compared(own, others, seconds, config.differing(other.shared_digests))
 
 

@@ -4,9 +4,10 @@ verb without `--fleet` reaches the flight and not a file that lies about.
 
 import fcntl
 import os
+import stat
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from companion.config.file import read_tables
@@ -16,9 +17,17 @@ from companion.errors import ConfigError
 SUFFIX = ".flying"
 
 
-def _folder() -> Path:
-    """This user's own: notes in a folder that all share could be anybody's."""
-    return Path(tempfile.gettempdir()) / f"starling-fleet-{os.getuid()}"
+def _folder() -> Path | None:
+    """This user's own, made if it is not there: notes in a folder that all share could be anybody's. None if it cannot
+    be had, or if somebody else has put something in its place."""
+    folder = Path(tempfile.gettempdir()) / f"starling-fleet-{os.getuid()}"
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        found = folder.lstat()
+    except OSError:
+        return None
+    ours = stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022
+    return folder if ours else None
 
 
 @contextmanager
@@ -26,35 +35,30 @@ def noted(fleet_name: str, file: Path) -> Iterator[None]:
     """Note a flight by its fleet's name as long as it lasts.
 
     The note is locked: the kernel lets go of it with the process, and what is left behind by one that was killed names
-    nobody. A folder that cannot be written costs the note, not the flight.
+    nobody. A folder that cannot be had costs the note, not the flight.
     """
-    fd = -1
-    with suppress(OSError):
-        folder = _folder()
-        folder.mkdir(mode=0o700, exist_ok=True)
-        fd = os.open(folder / f"{fleet_name}{SUFFIX}", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
-        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        os.ftruncate(fd, 0)
-        os.write(fd, os.fsencode(file.resolve()))
-    try:
+    folder = _folder()
+    if folder is None:
         yield
-    finally:
-        if fd >= 0:
-            os.close(fd)
+        return
+    note = folder / f"{fleet_name}{SUFFIX}"
+    with ExitStack() as held:
+        with suppress(OSError):
+            fd = os.open(note, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+            held.callback(os.close, fd)
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            held.callback(note.unlink, missing_ok=True)
+            os.ftruncate(fd, 0)
+            os.write(fd, os.fsencode(file.resolve()))
+        yield
 
 
 def flying_files() -> dict[str, Path]:
     """The files of the flights that go on, by their fleets' names."""
-    found = {}
     folder = _folder()
-    with suppress(OSError):
-        if folder.is_symlink() or folder.stat().st_uid != os.getuid():
-            return {}
-        for note in sorted(folder.glob(f"*{SUFFIX}")):
-            file = _read(note)
-            if file is not None and file.exists():
-                found[note.stem] = file
-    return found
+    notes = [] if folder is None else sorted(folder.glob(f"*{SUFFIX}"))
+    files = {note.stem: _read(note) for note in notes}
+    return {name: file for name, file in files.items() if file is not None and file.is_file()}
 
 
 def _read(note: Path) -> Path | None:

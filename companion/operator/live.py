@@ -1,6 +1,5 @@
 """The table of a fleet as it goes on: redrawn on a terminal, a line every few seconds elsewhere."""
 
-import signal
 import time
 from collections.abc import Callable, Sequence
 from types import TracebackType
@@ -10,6 +9,7 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
+from companion.interrupts import interrupts
 from companion.operator.views import Vehicles, phases, status_table
 from companion.terminal import one_line, printable
 
@@ -72,14 +72,11 @@ def _nearest(vehicles: Vehicles) -> str:
 
 def watch(ask: Callable[[], Vehicles], name: str) -> None:
     """Show what `ask` returns of a fleet of that name, once a second, until SIGINT or SIGTERM. Main thread only."""
-    came: list[int] = []
-    # Whoever is started in the background ignores SIGINT, unless it says otherwise.
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda n, _: came.append(n))
+    interrupted = interrupts()
     began_s = time.monotonic()
     with LiveTable() as table:
-        while not came:
+        while not interrupted():
             asked_s = time.monotonic()
             table.show(ask(), asked_s - began_s, name)
-            while not came and time.monotonic() < asked_s + ASKED_EVERY_S:
+            while not interrupted() and time.monotonic() < asked_s + ASKED_EVERY_S:
                 time.sleep(STOPPED_WITHIN_S)

@@ -9,7 +9,7 @@ from copy import deepcopy
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import tomli_w
@@ -28,7 +28,7 @@ from sim.launch.faults import CompanionFault, CompanionFaultKind, ScheduledFault
 from sim.launch.jobs import CompanionJob, ReferenceJob, StubsJob
 from sim.launch.processes import END_TIMEOUT_S, FleetProcesses
 from sim.launch.reference_loop import read_reference_loop
-from sim.launch.summary.flight import Flight
+from sim.launch.summary.flight import CENTROID_GPS_M, CENTROID_M, Flight
 from sim.launch.summary.summarise import summarise
 from sim.launch.watch import LANDING_TIMEOUT_S, MissingError, Progress, Watch
 
@@ -67,6 +67,14 @@ class FlightOptions:
     """after the operator's landing command nobody is waited for any longer"""
 
 
+class Flown(NamedTuple):
+    """A flight that has ended."""
+
+    flight: Flight
+    summary: dict[str, Any]
+    """as `summary.json` holds it"""
+
+
 def flight_folder(root: Path) -> Path:
     """A new folder for a flight, named by UTC."""
     stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
@@ -88,8 +96,8 @@ def fly(
     show: Callable[[Progress], None],
     interrupted: Callable[[], bool],
     tell: Callable[[str], None],
-) -> dict[str, Any]:
-    """Fly a fleet of stubs from take-off to landing; returns the summary, which also lies in the flight's folder.
+) -> Flown:
+    """Fly a fleet from take-off to landing; the summary also lies in the flight's folder.
 
     `tables` is fleet.toml with its overrides. Raises CompanionError when the fleet does not come up.
     """
@@ -130,7 +138,7 @@ class _Launch:
         """A file that the SITL instances' host makes once their parameters are set."""
         return None if self.options.px4 is None else self.options.folder / "autopilots.ready"
 
-    def fly(self, tables: dict[str, Any]) -> dict[str, Any]:
+    def fly(self, tables: dict[str, Any]) -> Flown:
         """Everything but the end of the processes, which is the caller's whatever happens."""
         began_s = time.monotonic()
         config = self._write_configuration(tables)
@@ -248,14 +256,14 @@ class _Launch:
         lost: frozenset[int],
         autopilots_lost: Mapping[int, str],
         missing: Mapping[int, str],
-    ) -> dict[str, Any]:
+    ) -> Flown:
         options = self.options
         flight = Flight(
             config=config,
             seed=options.seed,
             truth=np.fromfile(self._truth, TRUTH_DTYPE) if self._truth.exists() else np.zeros(0, TRUTH_DTYPE),
             takeoff_ns=watch.asked_ns,
-            centroid_limit_m=0.5 if options.px4 is None else 1.0,
+            centroid_limit_m=CENTROID_M if options.px4 is None else CENTROID_GPS_M,
             lost=lost,
             autopilots_lost=autopilots_lost,
             disarmed={i: not said.armed for i, said in watch.said.items()},
@@ -276,7 +284,7 @@ class _Launch:
             "flight_logs": {i: _flight_logs(options.folder / f"px4-{i}") for i in watch.ids} if options.logs else {},
         }
         _write(options.folder / "summary.json", json.dumps(summary, indent=2) + "\n")
-        return summary
+        return Flown(flight, summary)
 
 
 def _flight_logs(folder: Path) -> list[str]:

@@ -2,12 +2,15 @@
 
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from companion.errors import CompanionError, ConfigError
 from companion.terminal import tell
+
+if TYPE_CHECKING:
+    from sim.launch.summary.flight import Flight
 
 FAILED = 1
 PAGE = "report.html"
@@ -31,7 +34,7 @@ def mount(app: typer.Typer) -> None:
     app.add_typer(log_app, name="log")
 
 
-def _read(paths: list[Path], number: int | None) -> tuple[Any, dict[str, Any]]:
+def _read(paths: list[Path], number: int | None) -> "tuple[Flight, dict[str, Any]]":
     """The flight and its figures."""
     from sim.launch.summary.recorded import recorded_flight
     from sim.launch.summary.summarise import summarise
@@ -79,12 +82,16 @@ def report(
     tell(f"report: {file}")
 
 
-def report_if_it_can(folder: Path) -> None:
+def draw(flight: "Flight", figures: dict[str, Any], folder: Path) -> None:
     """The page of a flight that has just ended; that it cannot be drawn is told, and is no fault of the flight."""
+    from sim.report.page import write_page
+
     try:
-        report([folder])
+        write_page(flight, figures, folder / PAGE)
     except CompanionError as error:
         tell(f"no report: {error}", error=True)
+    else:
+        tell(f"report: {folder / PAGE}")
 
 
 def compare(

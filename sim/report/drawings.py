@@ -19,7 +19,9 @@ LATENESS_BINS = 200
 
 
 def drawings(series: Series, config: FleetConfig) -> Iterator[tuple[str, str, str]]:
-    """Each figure's title, what it shows, and its SVG."""
+    """Each figure's title, what it shows, and its SVG; none where nobody flew."""
+    if not series.ids:
+        return
     figures: list[tuple[str, str, Callable[[], Any]]] = [
         (
             "Paths from above", "Circles: where each was at take-off. Crosses: the wanted places at the end.",

@@ -67,23 +67,19 @@ class Series:
 
 
 def series_of(flight: Flight) -> Series:
-    """The series of a flight at ten times a second, while every companion ticks."""
-    ids = flight.staying
+    """The series of a flight at ten times a second, while every companion ticks that flew to the end; where none did,
+    of all that flew."""
+    ids = flight.staying or [i for i, rows in sorted(flight.ticks.items()) if len(rows)]
     history = flight.history()
     times = times_of(flight, ids)
-    truth = truth_of(flight.truth, [v.id for v in flight.config.vehicles])
+    truth = truth_of(flight.truth, ids)
     known = len(truth.times_ns) > 0
     if known:
-        columns = [[v.id for v in flight.config.vehicles].index(i) for i in ids]
         inside = (times >= truth.times_ns[0]) & (times <= truth.times_ns[-1])
         times = times[inside]
-        position = np.stack(
-            [
-                np.stack([np.interp(times, truth.times_ns, truth.position_ned_m[:, k, a]) for a in range(3)], axis=1)
-                for k in columns
-            ],
-            axis=1,
-        )
+        position = np.full((len(times), len(ids), 3), np.nan)
+        for k, axis in np.ndindex(len(ids), 3):
+            position[:, k, axis] = np.interp(times, truth.times_ns, truth.position_ned_m[:, k, axis])
     else:
         position = motion_of(flight, ids, times, POSITION)
     slots = _slots(history, ids, times)

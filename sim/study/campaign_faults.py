@@ -45,7 +45,7 @@ EXPLAINED: dict[str, frozenset[Failsafe]] = {
         "gps_stuck": _NO_POSITION | {_F.POSITION_JUMPS, _F.COVARIANCE, _F.NOT_FOLLOWED},
         "gps_wrong": _NO_POSITION | {_F.POSITION_JUMPS, _F.COVARIANCE, _F.NOT_FOLLOWED},
         "link_lost": _NO_POSITION | {_F.HEARTBEAT, _F.PILOT},
-        "wind": {_F.NOT_FOLLOWED},
+        "wind": set(),
         "battery_empty": {_F.BATTERY_LOW, _F.BATTERY_CRITICAL, _F.NOT_ARMED, _F.AUTOPILOT},
         "px4_restarted": _NO_POSITION | {_F.HEARTBEAT, _F.PILOT},
     }.items()

@@ -22,7 +22,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from companion.config.file import parse
 from companion.core.frames import Ned
 from companion.core.values import FLYING_PHASES, Phase
 from companion.errors import CompanionError, ConfigError
@@ -30,11 +29,10 @@ from companion.wire.mavlink import ON_GROUND
 from sim.autopilot.faults import Fault, FaultKind
 from sim.autopilot.stubs import TRUTH_DTYPE
 from sim.launch.faults import CompanionFault, CompanionFaultKind, ScheduledFault
-from sim.launch.launch import FlightOptions, fly
+from sim.launch.launch import FlightOptions, Flown, fly
 from sim.launch.lock import only_flight
 from sim.launch.px4_build import build_version, find_build, has_parameter
 from sim.launch.sitl_faults import kinds_of
-from sim.launch.summary.flight import Flight as FlightRecord
 from sim.launch.summary.truth import ALOFT_M
 from sim.launch.watch import Progress
 from sim.study.campaign import campaign_tables
@@ -234,23 +232,18 @@ def fly_px4(flight: Flight, seed: int, build: Path, slot: int = 0, keep: Path | 
         said: list[str] = []
         try:
             with only_flight(tables["fleet"]["name"]):
-                summary = fly(tables, options, eye.look, lambda: eye.over, said.append)
+                flown = fly(tables, options, eye.look, lambda: eye.over, said.append)
             eye.end()
-            record = _record(flight, faults, tables, folder, summary, eye)
+            record = _record(flight, faults, flown, eye)
         finally:
             if keep is not None:
                 shutil.copytree(folder, keep, dirs_exist_ok=True)
     return {**record, "said": said}
 
 
-def _record(
-    flight: Flight, faults: Sequence[Drawn], tables: dict[str, Any], folder: Path, summary: dict[str, Any], eye: _Eye
-) -> Record:
-    account = FlightRecord(parse(tables, "campaign.toml"), seed=0, truth=np.zeros(0), takeoff_ns=0)
-    for i in eye.ids:
-        account.read_files(i, sorted(folder.glob(f"vehicle-{i}.mcap")) + sorted(folder.glob(f"vehicle-{i}-*.mcap")))
-    truth = np.fromfile(folder / "truth.bin", TRUTH_DTYPE)
-    seen = seen_of(truth, eye.ids, sorted(account.events, key=lambda e: e[0]), int(summary["takeoff_ns"]))
+def _record(flight: Flight, faults: Sequence[Drawn], flown: Flown, eye: _Eye) -> Record:
+    account, summary = flown
+    seen = seen_of(account.truth, eye.ids, sorted(account.events, key=lambda e: e[0]), account.takeoff_ns)
     raised = [name for name in summary["rejected"] if RAISED.fullmatch(name)]
     killed = {f.vehicle_id for f in faults if f.kind == "killed"}
     ended = {int(i): s for i, s in summary["exit_status"].items() if s not in (0, None) and int(i) not in killed}

@@ -151,17 +151,15 @@ def load_config(name: str, path: Path | None = None) -> Config:
     shipped = Path(__file__).with_name(f"{name}.toml")
     text = read_text(path or shipped)
     values = tables_of(text, path or shipped)
+    if path is not None:
+        same_tables(values, tables_of(read_text(shipped), shipped), path, shipped)
     config = Config(name, text, values, "" if path is None else str(path))
-    if not isinstance(config.values.get("base", {}), dict) or not isinstance(config.values.get("cases", {}), dict):
-        raise ConfigError(f"{config.where}: $.base and $.cases must be tables")
     for setup in [config.base, *config.cases().values()]:
         if not connected(setup.formation.slots(), setup.range_m):
             raise ConfigError(
                 f"{config.where}: the formation is not connected at range_m = {setup.range_m:g} m: "
                 "raise range_m or bring the slots closer together"
             )
-    if path is not None:
-        same_tables(values, tables_of(read_text(shipped), shipped), path, shipped)
     return config
 
 

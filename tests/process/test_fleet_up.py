@@ -1,25 +1,17 @@
-"""Whole fleets as a user starts them: real processes, MAVLink over UDP, peers over Zenoh."""
+"""A fleet as a user starts it, under an operator's commands and strangers' garbage: real processes, UDP and Zenoh."""
 
 from __future__ import annotations
 
-import itertools
 import json
-import os
 import random
-import resource
 import signal
-import socket
 import struct
 import subprocess
-import sys
 import time
 import tomllib
-from collections.abc import Iterator
-from contextlib import ExitStack
 from dataclasses import dataclass, field
 from math import nan
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -28,92 +20,35 @@ import zenoh
 from fleet_process import (
     SETTLED,
     Fleet,
-    Process,
     all_in,
-    child,
-    children,
     eventually,
     flight_folder,
-    gone,
     make_fleet,
-    minimum_distance_m,
     operator_of,
-    ports_free,
     run,
     started,
     status_json,
-    truth,
     wait_status,
 )
-from pymavlink.dialects.v20 import development as dialect
+from strangers import datagrams, failsafes, rejected, send
 
-from companion.__main__ import main as companion_main
-from companion.core.events import KillCause
-from companion.core.failsafe import Failsafe
 from companion.core.frames import Ned
 from companion.core.values import PeerMessage, PeerSample, Phase
-from companion.io.recording import read_recording
 from companion.io.replay import replay_file
 from companion.io.zenoh.configuration import (
     PLANS_HZ,
     REQUESTS_HZ,
     SessionSettings,
-    scouting_port,
     zenoh_configuration,
 )
-from companion.operator.client import Operator
 from companion.wire.operator import Status
 from companion.wire.peer import encode_state
-from companion.wire.px4 import Px4Mode
-from sim.__main__ import main as fleet_main
 from sim.launch.summary.recorded import recorded_flight
 from sim.report.series import series_of
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(400)]
-
 FOR_EVER = "velocity:0.5:0:3600"
-EDITED = Failsafe.CONFIGURATION.value
-ON_GROUND = 1
 STALL_MS = 300.0
-LOOPBACK = "127.0.0.1"
-
-
-def datagrams(system_id: int) -> list[bytes]:
-    """What a companion may be sent by somebody who is not its autopilot, or by a broken one."""
-    mine = dialect.MAVLink(None, srcSystem=system_id, srcComponent=1)
-    other = dialect.MAVLink(None, srcSystem=222, srcComponent=1)
-    heartbeat = dialect.MAVLink_heartbeat_message(2, 12, 81, 0, 3, 3)
-    position = dialect.MAVLink_local_position_ned_message(1000, nan, 0.0, 0.0, 0.0, 0.0, 0.0)
-    infinite = dialect.MAVLink_local_position_ned_message(1000, 0.0, 0.0, 0.0, float("inf"), 0.0, 0.0)
-    noise = random.Random(7)
-    whole = heartbeat.pack(mine)
-    return [
-        *(noise.randbytes(n) for n in (1, 9, 40, 280, 2000)),
-        b"",
-        b"\xfd" + noise.randbytes(30),
-        whole[:11],
-        whole[:-1],
-        whole[:-2] + b"\0\0",
-        heartbeat.pack(other),
-        position.pack(mine),
-        infinite.pack(mine),
-    ]
-
-
-def send(port: int, messages: list[bytes]) -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as s:
-        s.bind((LOOPBACK, 0))
-        for message in messages:
-            s.sendto(message, (LOOPBACK, port))
-
-
-def failsafes(said: list[str]) -> list[str]:
-    """All but what a machine that stalls for half a second does to a vehicle; that is not what is tested here."""
-    return [what for what in said if "own position stale" not in what]
-
-
-def rejected(status: Status, kind: str) -> int:
-    return status.rejected.get(kind, 0)
 
 
 # -- one flight with everything that an operator and a stranger may do -----------------------------------------------
@@ -415,419 +350,3 @@ def test_garbage_from_peers_is_counted_by_kind_and_moves_nothing(flown: Flown) -
     assert rejected(first, "command: malformed") >= 3
     assert last is not None
     assert rejected(last, "own id heard from another") >= 5
-
-
-# -- one companion is killed, another one's disk is full, and Ctrl-C lands the rest -----------------------------------
-
-
-@dataclass(slots=True)
-class Loss:
-    """A flight that loses a companion."""
-
-    fleet: Fleet
-    killed_ns: int = 0
-    exit_status: int = -1
-    out: str = ""
-    err: str = ""
-    folder: Path = Path()
-    others: dict[int, Status] = field(default_factory=dict)
-    """what the others said after the lost vehicle had landed"""
-
-    @property
-    def summary(self) -> dict[str, Any]:
-        summary: dict[str, Any] = json.loads((self.folder / "summary.json").read_text())
-        return summary
-
-
-@pytest.fixture(scope="module")
-def loss(tmp_path_factory: pytest.TempPathFactory) -> Loss:
-    """Formed and moving; the companions' server and companion 2 die, companion 3 can write no more, the file is edited,
-    the launcher is interrupted."""
-    fleet = make_fleet(tmp_path_factory.mktemp("loss"), 4)
-    loss = Loss(fleet)
-    out = fleet.folder / "flights"
-    arguments = ("sim", "up", "--fleet", str(fleet.file), "--out", str(out), "--plan", FOR_EVER)
-    with started(*arguments, folder=fleet.folder, name="up") as up, operator_of(fleet) as operator:
-        wait_status(operator, all_in(fleet.ids, *SETTLED, revision=2))
-        loss.folder = flight_folder(out)
-        resource.prlimit(child(up.popen.pid, "run --vehicle 3 "), resource.RLIMIT_FSIZE, (0, 0))
-        os.kill(child(up.popen.pid, "companions' server"), signal.SIGKILL)
-        os.kill(child(up.popen.pid, "run --vehicle 2 "), signal.SIGKILL)
-        loss.killed_ns = time.time_ns()
-        with (loss.folder / "fleet.toml").open("a") as file:
-            file.write("# edited in flight\n")
-        assert eventually(lambda: truth(loss.folder / "truth.bin", 2)["armed"][-1] == 0)
-        loss.others = wait_status(
-            operator,
-            lambda said: sorted(said) == [1, 3, 4] and all(rejected(s, EDITED) for s in said.values()),
-        )
-        up.signal(signal.SIGINT)
-        loss.exit_status = up.wait()
-        loss.out, loss.err = up.out, up.err
-    return loss
-
-
-def test_the_lost_vehicles_autopilot_lands_it_by_its_own_failsafe(loss: Loss) -> None:
-    track = truth(loss.folder / "truth.bin", 2)
-    after = track[track["time_unix_ns"] > loss.killed_ns]
-    landing = after[after["custom_mode"] == Px4Mode.AUTO_LAND]
-    assert (landing["time_unix_ns"][0] - loss.killed_ns) * 1e-9 < 3.0
-    assert after["landed_state"][-1] == ON_GROUND
-
-
-def test_the_others_fly_on_and_keep_their_distance(loss: Loss) -> None:
-    assert sorted(loss.others) == [1, 3, 4]
-    for status in loss.others.values():
-        assert status.phase in SETTLED
-        assert failsafes(status.failsafes) == []
-    assert minimum_distance_m(loss.folder / "truth.bin") >= 1.2
-
-
-def test_a_lost_companion_fails_the_flight_and_is_named(loss: Loss) -> None:
-    assert loss.exit_status == 1
-    assert loss.summary["lost"] == [2]
-    assert loss.summary["passed"] is False
-    assert "companions lost" in loss.out
-    assert "ended: companion 2, status -9 (SIGKILL)" in loss.err
-    assert loss.summary["exit_status"] == {"1": 0, "2": -signal.SIGKILL, "3": 0, "4": 0}
-
-
-def test_ctrl_c_lands_the_fleet_and_still_writes_the_summary(loss: Loss) -> None:
-    assert all(loss.summary["landed"].values())
-    assert failsafes(loss.summary["failsafes"]) == []
-    for i in (1, 3, 4):
-        assert truth(loss.folder / "truth.bin", i)["custom_mode"].tolist().count(Px4Mode.AUTO_LAND) > 0
-
-
-def test_a_companion_that_can_write_no_more_flies_on(loss: Loss) -> None:
-    assert loss.others[3].recorder_lost > 0
-    assert loss.others[3].phase in SETTLED
-    assert {i: rejected(s, Failsafe.DISK_FULL.value) for i, s in loss.others.items()} == {1: 0, 3: 1, 4: 0}
-
-
-def test_a_file_edited_in_flight_is_noted_once_and_changes_nothing(loss: Loss) -> None:
-    for i in (1, 3, 4):
-        assert rejected(loss.others[i], EDITED) == 1
-        assert loss.others[i].phase in SETTLED
-        notes = read_recording(loss.folder / f"vehicle-{i}.mcap").entries
-        told = [e.body for e in notes if e.channel == "note" and EDITED.encode() in e.body]
-        assert len(told) == (i != 3), "vehicle 3 can write no more"
-
-
-def test_without_a_terminal_progress_is_a_line_now_and_then(loss: Loss) -> None:
-    lines = loss.err.splitlines()
-    assert any("flying: 4 climbing" in line for line in lines)
-    assert any("s  landing" in line for line in lines)
-    assert "\x1b" not in loss.err
-    assert len(lines) < 40
-    assert "minimum distance" in loss.out
-
-
-# -- the operator kills -----------------------------------------------------------------------------------------------
-
-
-def test_a_fleet_that_its_operator_kills_in_flight_falls_is_shown_as_killed_and_fails(tmp_path: Path) -> None:
-    fleet = make_fleet(tmp_path, 2)
-    out = tmp_path / "flights"
-    arguments = ("sim", "up", "--json", "--fleet", str(fleet.file), "--out", str(out), "--plan", FOR_EVER)
-    with started(*arguments, folder=tmp_path, name="up") as up:
-        with operator_of(fleet) as operator:
-            wait_status(operator, all_in(fleet.ids, "waiting", *SETTLED))
-        killed = run("sim", "kill", "--yes", "--fleet", str(fleet.file), folder=tmp_path)
-        assert killed.returncode == 0, killed.stderr
-        assert up.wait(30.0) == 1
-    summary = json.loads(up.out)
-    assert summary["passed"] is False
-    assert summary["killed"] == {str(i): KillCause.COMMAND.value for i in fleet.ids}
-    assert [c["met"] for c in summary["criteria"] if c["what"] == "vehicles killed"] == [False]
-    (command,) = (c for c in summary["commands"] if c["verb"] == "kill")
-    assert (command["accepted"], command["refused"], command["unanswered"]) == (fleet.ids, {}, [])
-    for i in fleet.ids:
-        track = truth(flight_folder(out) / "truth.bin", i)
-        assert track["armed"][-1] == 0
-        assert track["velocity_ned_m_s"][:, 2].max() > 2.0
-
-
-# -- the launcher itself dies ----------------------------------------------------------------------------------------
-
-
-def still_there(pids: list[int]) -> list[int]:
-    return [pid for pid in pids if not gone(pid)]
-
-
-def test_no_child_outlives_a_launcher_killed_in_flight_and_the_vehicles_are_landing(tmp_path: Path) -> None:
-    fleet = make_fleet(tmp_path, 2)
-    out = tmp_path / "flights"
-    with started("sim", "up", "--fleet", str(fleet.file), "--out", str(out), folder=tmp_path) as up:
-        with operator_of(fleet) as operator:
-            wait_status(operator, all_in(fleet.ids, "waiting", "forming"))
-        pids = list(children(up.popen.pid).values())
-        assert len(pids) == 3 + len(fleet.ids)
-        up.signal(signal.SIGKILL)
-        assert eventually(lambda: not still_there(pids), 2.0), still_there(pids)
-    assert ports_free(fleet)
-    for i in fleet.ids:
-        assert truth(flight_folder(out) / "truth.bin", i)["custom_mode"][-1] == Px4Mode.AUTO_LAND
-        assert (flight_folder(out) / f"companion-{i}.log").read_text().count("-> landing") == 1
-
-
-def test_no_child_outlives_a_launcher_killed_while_they_start(tmp_path: Path) -> None:
-    fleet = make_fleet(tmp_path, 1)
-    with started("sim", "up", "--fleet", str(fleet.file), "--out", str(tmp_path / "o"), folder=tmp_path) as up:
-        assert eventually(lambda: len(children(up.popen.pid)) == 3 + len(fleet.ids))
-        pids = list(children(up.popen.pid).values())
-        up.signal(signal.SIGKILL)
-        up.wait()
-        # A process that has not begun to run Python yet watches nothing yet either.
-        assert eventually(lambda: not still_there(pids), 4.0), still_there(pids)
-    assert ports_free(fleet)
-
-
-# -- companions one by one -------------------------------------------------------------------------------------------
-
-
-@dataclass(slots=True)
-class Single:
-    """Three vehicles whose processes the test starts and ends itself, beside a fleet of another name."""
-
-    fleet: Fleet
-    truth: Path
-    before_autopilot: dict[int, Status] = field(default_factory=dict)
-    waiting: dict[int, Status] = field(default_factory=dict)
-    """two companions there, the third vehicle's not; another fleet has a vehicle 3"""
-    refused: subprocess.CompletedProcess[str] | None = None
-    other: dict[int, Status] = field(default_factory=dict)
-    """what the other fleet's vehicle 3 said meanwhile"""
-    busy: subprocess.CompletedProcess[str] | None = None
-    flying: dict[int, Status] = field(default_factory=dict)
-    restarted: dict[int, Status] = field(default_factory=dict)
-    """after vehicle 3's companion was killed and started again"""
-    terminated_status: int = -1
-    terminated_after_s: float = 0.0
-    mode_after_termination: int = 0
-    ended: list[int] = field(default_factory=list)
-    stub_status: int = -1
-    stub_err: str = ""
-
-
-class Companions:
-    """Starts companions of one fleet and keeps them until the end."""
-
-    def __init__(self, stack: ExitStack, fleet: Fleet) -> None:
-        self._stack, self._fleet = stack, fleet
-        self._numbers = itertools.count()
-
-    def start(self, vehicle_id: int) -> Process:
-        arguments = ("companion", "run", "--vehicle", str(vehicle_id), "--fleet", str(self._fleet.file))
-        name = f"companion-{vehicle_id}-{next(self._numbers)}"
-        return self._stack.enter_context(started(*arguments, folder=self._fleet.folder, name=name))
-
-
-def ready_but_for(said: dict[int, Status], ids: list[int], reasons: list[str]) -> bool:
-    return all(i in said and said[i].ready == reasons for i in ids)
-
-
-@pytest.fixture(scope="module")
-def single(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Single]:
-    """Late, restarted and terminated companions on one stub process."""
-    folder = tmp_path_factory.mktemp("single")
-    port = scouting_port(f"test-{os.getpid()}")
-    plan = {"legs": [{"kind": "velocity", "north_m_s": 0.5, "duration_s": 3600.0}]}
-    fleet = make_fleet(folder, 3, scouting=port, plan=plan)
-    foreign = make_fleet(folder, 3, scouting=port)
-    single = Single(fleet, folder / "truth.bin")
-    with ExitStack() as stack:
-        mine, theirs = Companions(stack, fleet), Companions(stack, foreign)
-        operator = stack.enter_context(operator_of(fleet))
-        first, second = mine.start(1), mine.start(2)
-        theirs.start(3)
-        wait_status(operator, lambda said: sorted(said) == [1, 2])
-        send(fleet.port, datagrams(1))
-        single.before_autopilot = wait_status(
-            operator, lambda said: 1 in said and sum(said[1].rejected.values()) >= len(datagrams(1)) - 1
-        )
-        stub = stack.enter_context(
-            started("sim", "stub", "--fleet", str(fleet.file), "--truth", str(single.truth), folder=folder, name="stub")
-        )
-        stack.enter_context(started("sim", "stub", "--fleet", str(foreign.file), folder=folder, name="foreign"))
-        with operator_of(foreign) as other:
-            single.other = wait_status(other, lambda said: ready_but_for(said, [3], ["not heard: vehicle 1, 2"]))
-        single.waiting = wait_status(operator, lambda said: ready_but_for(said, [1, 2], ["not heard: vehicle 3"]))
-        single.refused = run("sim", "takeoff", "--fleet", str(fleet.file), folder=folder)
-        third = mine.start(3)
-        single.busy = run("companion", "run", "--vehicle", "1", "--fleet", str(fleet.file), folder=folder)
-        wait_status(operator, lambda said: ready_but_for(said, [1, 2, 3], []))
-        assert operator.take_off().all_accepted
-        single.flying = wait_status(operator, all_in(fleet.ids, *SETTLED, revision=2))
-        third.signal(signal.SIGKILL)
-        third.wait()
-        again = mine.start(3)
-        single.restarted = wait_status(
-            operator, lambda said: len(said) == 3 and said[3].revision == 2 and not said[3].armed
-        )
-        before = time.monotonic()
-        second.signal(signal.SIGTERM)
-        single.terminated_status = second.wait()
-        single.terminated_after_s = time.monotonic() - before
-        assert eventually(lambda: truth(single.truth, 2)["custom_mode"][-1] == Px4Mode.AUTO_LAND, 2.0)
-        _land(operator, single, first)
-        single.ended = [_end(p) for p in (first, again)]
-        stub.signal(signal.SIGINT)
-        single.stub_status = stub.wait()
-        single.stub_err = stub.err
-        yield single
-
-
-def _land(operator: Operator, single: Single, first: Process) -> None:
-    operator.land()
-    wait_status(operator, lambda said: said[1].phase == "landed")
-    assert first.popen.poll() is None
-
-
-def _end(process: Process) -> int:
-    process.signal(signal.SIGTERM)
-    return process.wait()
-
-
-def test_what_no_autopilot_may_say_is_counted_by_kind_before_there_is_one(single: Single) -> None:
-    status = single.before_autopilot[1]
-    assert "no heartbeat from the autopilot" in status.ready
-    assert rejected(status, "not finite") == 2
-    assert rejected(status, "foreign system") >= 1
-    assert rejected(status, "malformed") >= 8
-    assert rejected(status, "mavlink: another address than the autopilot's") == 0
-
-
-def test_fleets_of_different_names_do_not_hear_each_other_on_one_scouting_port(single: Single) -> None:
-    assert single.waiting[1].ready == ["not heard: vehicle 3"]
-    assert 3 not in single.waiting
-    assert single.other[3].phase == "idle"
-    assert single.other[3].neighbours == 0
-    assert single.other[3].rejected.keys().isdisjoint({"own id", "foreign id", "peer: under our own id"})
-
-
-def test_take_off_is_refused_while_a_vehicle_is_missing(single: Single) -> None:
-    assert single.refused is not None
-    assert single.refused.returncode == 1
-    assert "vehicle 1: not heard: vehicle 3" in single.refused.stderr
-    assert "\n  not heard: vehicle 3\n" in single.refused.stderr
-
-
-def test_a_companion_that_comes_late_flies_with_the_others(single: Single) -> None:
-    assert {s.phase for s in single.flying.values()} <= set(SETTLED)
-    assert len(single.flying) == 3
-
-
-def test_a_second_companion_of_a_vehicle_says_which_port_is_in_use(single: Single) -> None:
-    assert single.busy is not None
-    assert single.busy.returncode == 1
-    assert single.busy.stderr.strip() == (
-        f"companion: vehicle 1: cannot listen on UDP 127.0.0.1:{single.fleet.port}: it is in use"
-    )
-
-
-def test_a_companion_restarted_in_flight_gets_the_plan_and_leaves_its_vehicle_to_the_autopilots_landing(
-    single: Single,
-) -> None:
-    third = single.restarted[3]
-    assert third.phase == "idle"
-    assert third.revision == 2
-    assert third.setpoints == 0
-    track = truth(single.truth, 3)
-    assert Px4Mode.AUTO_LAND in track["custom_mode"]
-    assert track["landed_state"][-1] == ON_GROUND
-
-
-def test_a_companion_restarted_in_flight_does_not_disturb_the_others(single: Single) -> None:
-    for i in (1, 2):
-        assert single.restarted[i].phase in SETTLED
-        assert failsafes(single.restarted[i].failsafes) == []
-    assert minimum_distance_m(single.truth) >= 1.2
-
-
-def test_a_companion_that_is_terminated_in_flight_lands_its_vehicle_and_exits_well(single: Single) -> None:
-    assert single.terminated_status == 0
-    assert single.terminated_after_s < 4.5
-    assert truth(single.truth, 2)["custom_mode"].tolist().count(Px4Mode.AUTO_LAND) > 0
-    assert single.ended == [0, 0]
-
-
-def test_stubs_alone_run_until_interrupted(single: Single) -> None:
-    assert single.stub_status == 0
-    assert f"vehicle 3: system id 3, speaks to udp://127.0.0.1:{single.fleet.port + 2}" in single.stub_err
-    assert "Traceback" not in single.stub_err
-
-
-# -- wrong usage -----------------------------------------------------------------------------------------------------
-
-
-WRONG = {
-    "an unknown vehicle": (("companion", "run", "--vehicle", "9", "--fleet", "{fleet}"), "vehicle 9 is not an enabled"),
-    "no file": (("companion", "run", "--vehicle", "1", "--fleet", "nowhere.toml"), "nowhere.toml: cannot be read"),
-    "a bad file": (("companion", "run", "--vehicle", "1", "--fleet", "{bad}"), "$.fleet.colour is not a known key"),
-    "a replay of nothing": (("companion", "replay", "nowhere.mcap"), "nowhere.mcap: cannot be read"),
-    "a replay of something else": (("companion", "replay", "{fleet}"), "is no MCAP file"),
-    "a bad file for a flight": (("fleet", "up", "--fleet", "{bad}"), "$.fleet.colour is not a known key"),
-    "an unknown leg": (
-        ("fleet", "up", "--fleet", "{fleet}", "--plan", "loop:3"),
-        "--plan: leg 'loop:3' must be one of",
-    ),
-    "a stub on a serial line": (("fleet", "stub", "--fleet", "{serial}"), "speaks to udp://127.0.0.1:PORT only"),
-}
-
-
-@pytest.mark.parametrize("case", WRONG)
-def test_wrong_usage_ends_with_a_sentence_and_status_2(
-    case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    arguments, words = WRONG[case]
-    fleet = make_fleet(tmp_path, 1)
-    bad, serial = tmp_path / "bad.toml", tmp_path / "serial.toml"
-    bad.write_text(fleet.file.read_text().replace("[fleet]", '[fleet]\ncolour = "red"'))
-    serial.write_text(fleet.file.read_text().replace(f"udp://127.0.0.1:{fleet.port}", "serial:///dev/ttyS0:921600"))
-    names = {"{fleet}": str(fleet.file), "{bad}": str(bad), "{serial}": str(serial)}
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", [names.get(a, a) for a in arguments])
-    with pytest.raises(SystemExit) as ended:
-        (companion_main if arguments[0] == "companion" else fleet_main)()
-    said = capsys.readouterr()
-    assert ended.value.code == 2
-    assert words in said.err
-    assert said.out == ""
-
-
-def test_a_recording_that_cannot_be_opened_ends_with_a_sentence_and_status_1(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    file = make_fleet(tmp_path, 1).file
-    monkeypatch.chdir(tmp_path)
-    arguments = ["companion", "run", "--vehicle", "1", "--fleet", str(file), "--record", "no/way.mcap"]
-    monkeypatch.setattr(sys, "argv", arguments)
-    with pytest.raises(SystemExit) as ended:
-        companion_main()
-    assert ended.value.code == 1
-    assert "--record no/way.mcap: cannot be written" in capsys.readouterr().err
-
-
-def test_a_companion_with_a_bad_file_ends_with_a_sentence_and_no_traceback(tmp_path: Path) -> None:
-    done = run("companion", "run", "--vehicle", "1", "--fleet", "nowhere.toml", folder=tmp_path)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == "companion: nowhere.toml: cannot be read: No such file or directory\n"
-
-
-def test_a_port_in_use_ends_the_launcher_with_a_sentence_that_names_it(tmp_path: Path) -> None:
-    fleet = make_fleet(tmp_path, 1)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
-        taken.bind((LOOPBACK, fleet.port + 40))
-        done = run("sim", "up", "--fleet", str(fleet.file), "--out", str(tmp_path / "o"), folder=tmp_path)
-    assert done.returncode == 1
-    assert f"vehicle 1: UDP port {fleet.port + 40} of its autopilot is in use" in done.stderr
-    assert "Traceback" not in done.stderr
-
-
-def test_nobody_up_is_said_by_the_operators_verbs(tmp_path: Path) -> None:
-    fleet = make_fleet(tmp_path, 1)
-    assert status_json(fleet) == (1, {1: None})
-    done = run("sim", "hold", "--fleet", str(fleet.file), folder=tmp_path)
-    assert done.returncode == 1
-    assert "no vehicle answers" in done.stderr

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.config import FleetConfig, load
-from companion.config.checks import faults_on_one_computer
+from companion.config.checks import refuse_shared_lines
 from companion.config.endpoints import autopilot_port, companion_port, serial_endpoint, udp_endpoint
 from companion.config.file import parse
 from companion.config.overrides import on_this_computer, plan_legs, resize
@@ -276,10 +276,12 @@ LINES = ("serial:///dev/autopilot:921600", "udp://0.0.0.0:14540")
 def test_lines_of_one_name_on_several_computers_are_as_many_lines(line: str) -> None:
     config = parse(changed(on_computers(*[line] * 6)), "fleet.toml")
     assert [v.mavlink for v in config.vehicles] == [line] * 6
-    (said,) = faults_on_one_computer(config)
-    assert said.startswith(
-        f"vehicles 1, 2, 3, 4, 5, 6 have one line, mavlink = {line!r}, and one computer has one of it"
+    with pytest.raises(ConfigError) as caught:
+        refuse_shared_lines(config)
+    assert str(caught.value).startswith(
+        f"vehicles 1, 2, 3, 4, 5, 6 have one line, mavlink = {line!r}, and one computer "
     )
+    assert "fleet up --rehearse" in str(caught.value)
 
 
 @pytest.mark.parametrize(("host", "where"), [("10.0.0.1", " on 10.0.0.1"), ("127.0.0.1", ""), ("[::1]", "")])
@@ -293,10 +295,17 @@ def test_a_hardware_file_is_rehearsed_on_one_computer_with_its_own_network_limit
     hardware = parse(tables, "fleet.toml")
     on_this_computer(tables)
     here = parse(tables, "fleet.toml")
-    assert not faults_on_one_computer(here)
+    refuse_shared_lines(here)
     assert (here.peers.network, here.notice_lost_s) == ("laptop", hardware.notice_lost_s)
     assert [v.mavlink for v in here.vehicles] == [f"udp://127.0.0.1:{companion_port(k)}" for k in range(6)]
     assert not here.preflight.require_rc
+    assert here.fleet.name == f"{hardware.fleet.name}-rehearsal", "no verb for the vehicles reaches it"
+
+
+def test_the_longest_name_leaves_room_for_a_rehearsals() -> None:
+    tables = changed(put("fleet.name", "a" * 32))
+    on_this_computer(tables)
+    assert parse(tables, "fleet.toml").fleet.name == f"{'a' * 22}-rehearsal"
 
 
 def line_of(*slots: list[float]) -> Change:

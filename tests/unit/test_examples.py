@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from companion.config.checks import faults_on_one_computer
+from companion.config.checks import refuse_shared_lines
 from companion.config.file import load, parse, read_tables
 from companion.config.overrides import on_this_computer
 
@@ -21,7 +21,7 @@ def test_there_are_examples() -> None:
 def test_an_example_is_fit_for_its_vehicles_and_for_a_rehearsal(path: Path) -> None:
     config = load(path)
     tables = read_tables(path, on_this_computer)
-    assert not faults_on_one_computer(parse(tables, path.name))
+    refuse_shared_lines(parse(tables, path.name))
     assert len({v.zenoh for v in config.vehicles}) == len(config.vehicles)
 
 

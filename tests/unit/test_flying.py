@@ -81,12 +81,36 @@ def test_what_a_killed_launcher_left_names_nobody(tmp_path: Path) -> None:
         assert flying_files() == {"one": file}
 
 
+def test_a_flight_that_ended_leaves_no_note(tmp_path: Path) -> None:
+    with noted("one", flight(tmp_path, "one")):
+        pass
+    assert list((tmp_path / f"starling-fleet-{os.getuid()}").iterdir()) == []
+
+
+def test_a_note_without_a_file_yet_names_nobody(tmp_path: Path) -> None:
+    (tmp_path / "one").mkdir()
+    for file in (tmp_path / "one" / "fleet.toml", tmp_path / "one"):  # not written yet; a folder
+        with noted("one", file):
+            assert flying_files() == {}
+            assert operated_file(None) == HERE
+
+
+def test_nothing_is_written_where_others_may_write(tmp_path: Path) -> None:
+    shared = tmp_path / f"starling-fleet-{os.getuid()}"
+    shared.mkdir()
+    shared.chmod(0o777)
+    with noted("one", flight(tmp_path, "one")):
+        assert flying_files() == {}
+    assert list(shared.iterdir()) == []
+
+
 def test_a_folder_of_somebody_elses_making_is_not_believed(tmp_path: Path) -> None:
     file = flight(tmp_path, "one")
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / f"starling-fleet-{os.getuid()}").symlink_to(tmp_path / "elsewhere")
     with noted("one", file):
         assert flying_files() == {}
+    assert list((tmp_path / "elsewhere").iterdir()) == []
 
 
 def test_without_a_place_to_note_it_a_flight_goes_on(tmp_path: Path) -> None:

@@ -112,6 +112,16 @@ def test_files_and_assignments_that_differ_are_named() -> None:
     assert said.startswith("vehicle 1: assigns the slots otherwise than the operator (hash 4567, must be ")
 
 
+HOSTILE = {"law": "", "x" * 64: "y" * 4000, "\x1b[2J\nvehicle 1: fit": "", "limits": "zzzz" * 10}
+
+
+def test_digests_that_are_none_are_told_on_one_printable_line() -> None:
+    (said,) = report({3: account(3, configuration="0123", digests=HOSTILE)}).faults
+    assert said.startswith("vehicle 3: its fleet.toml differs from the operator's in fleet, ")
+    assert said.isprintable()
+    assert len(said) <= 1100
+
+
 # -- clocks ------------------------------------------------------------------------------------------------------------
 
 

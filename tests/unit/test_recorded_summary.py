@@ -7,8 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from companion.errors import CompanionError
-from sim.launch.summary.recorded import recorded_flight, recordings_of, takeoffs_ns
+from companion.core.events import PhaseChanged
+from companion.core.values import Phase
+from companion.errors import CompanionError, ConfigError
+from companion.io.recording import read_recording
+from sim.launch.summary.recorded import one_of, recorded_flight, recordings_of, takeoffs_ns
 from sim.launch.summary.summarise import summarise
 
 GOLDEN = Path(__file__).resolve().parents[1] / "golden" / "px4_flight.mcap"
@@ -70,3 +73,38 @@ def test_recordings_of_two_fleets_are_refused_with_the_keys_that_differ(tmp_path
         CompanionError, match=r"other\.mcap: is of another fleet file than .*: formation\.altitude_m differ"
     ):
         recorded_flight([GOLDEN, other])
+
+
+def test_a_copy_of_a_recording_counts_nothing_twice(tmp_path: Path) -> None:
+    shutil.copy(GOLDEN, tmp_path / "copy.mcap")
+    with pytest.raises(
+        CompanionError, match=r"copy\.mcap: is of the same companion's life as .*px4_flight\.mcap: give one"
+    ):
+        recorded_flight([GOLDEN, tmp_path])
+
+
+@pytest.mark.parametrize(("hours", "fits"), [(23.9, True), (24.1, False), (1e6, False)])
+def test_a_flight_longer_than_a_day_is_refused_before_it_fills_the_computer(hours: float, fits: bool) -> None:
+    flight, _ = recorded_flight([GOLDEN])
+    ((vehicle, ticks),) = flight.ticks.items()
+    ticks["fleet_ns"][-1] = flight.takeoff_ns + round(hours * 3600e9)
+    if fits:
+        assert len(one_of(flight, None, set()).ticks[vehicle]) == len(ticks)
+    else:
+        with pytest.raises(
+            ConfigError, match=r"the flight would last \d+ hours, may last 24: a clock was set in between"
+        ):
+            one_of(flight, None, set())
+
+
+def test_a_companion_whose_recording_ends_open_in_the_air_was_lost_in_flight(tmp_path: Path) -> None:
+    whole, _ = recorded_flight([GOLDEN])
+    assert whole.lost == frozenset()
+    moving = next(ns for ns, _, e in whole.events if isinstance(e, PhaseChanged) and e.after is Phase.MOVING)
+    entries = list(read_recording(GOLDEN).entries)
+    share = sum(e.instant.fleet_ns <= moving + 10**9 for e in entries) / len(entries)
+    killed = tmp_path / "killed.mcap"
+    killed.write_bytes(GOLDEN.read_bytes()[: round(share * GOLDEN.stat().st_size)])
+    flight, _ = recorded_flight([killed])
+    assert flight.lost == {1}
+    assert summarise(flight)["passed"] is False

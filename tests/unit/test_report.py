@@ -1,6 +1,7 @@
 """A flight's page: whole, small, from one file, and nothing in it that somebody else has written as markup."""
 
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from companion.errors import CompanionError
 from sim.launch.summary.flight import Flight
 from sim.launch.summary.recorded import recorded_flight
 from sim.launch.summary.summarise import summarise
-from sim.report.commands import report_if_it_can
+from sim.report.commands import draw
 from sim.report.page import page, write_page
 from sim.report.series import HEARTBEAT_SHARE, Pair, series_of
 
@@ -113,9 +114,24 @@ def test_a_pair_that_never_was_known_is_the_last_of_the_closest() -> None:
     assert Pair((1, 2), np.zeros(0)).least_m == np.inf
 
 
-def test_a_flight_that_cannot_be_drawn_is_told_and_is_no_fault_of_the_flight(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("figures", [6, 0])
+def test_a_flight_of_which_nobody_is_left_has_its_page(
+    figures: int, flown: tuple[Flight, dict[str, Any]], tmp_path: Path
 ) -> None:
-    report_if_it_can(tmp_path)
-    assert capsys.readouterr().err == f"no report: {tmp_path}: no recording (*.mcap) is in this folder\n"
-    assert list(tmp_path.iterdir()) == []
+    flight, _ = flown
+    ticks = flight.ticks if figures else {i: rows[:0] for i, rows in flight.ticks.items()}
+    lost = replace(flight, lost=frozenset(flight.ticks), ticks=ticks)
+    text = page(lost, {**summarise(lost), "missing": {}, "rejected": None})
+    assert ">not passed</span></h1>" in text
+    assert read(text).seen.count("svg") == figures
+
+
+def test_a_flight_that_cannot_be_drawn_is_told_and_is_no_fault_of_the_flight(
+    flown: tuple[Flight, dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    draw(*flown, tmp_path / "none")
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err == f"no report: cannot write {tmp_path}/none/report.html: No such file or directory\n"
+    draw(*flown, tmp_path)
+    assert capsys.readouterr().out == f"report: {tmp_path}/report.html\n"

@@ -215,7 +215,7 @@ def test_a_study_that_cannot_be_run_is_refused_with_a_sentence(
 )
 def test_a_users_own_setup_is_checked(tmp_path: Path, text: str, says: str) -> None:
     path = tmp_path / "own.toml"
-    path.write_text(text, encoding="utf-8")
+    path.write_text(f"{text}\n[cases]\n[nulls]\n[published]\n", encoding="utf-8")
     with pytest.raises(ConfigError, match=says):
         study("table3", "0", tmp_path, setup=path, console=_quiet())
 

@@ -23,6 +23,8 @@ from companion.wire.peer import encode_motion
 
 Array = npt.NDArray[Any]
 GAPS_TOLD_MOST = 5
+CENTROID_M, CENTROID_GPS_M = 0.5, 1.0
+"""limits of the centroid's error: an estimator with a GPS of its own is off by more, as PX4's is in SITL"""
 _FORMATS = {int: "i8", float: "f8", bool: "?"}
 TICK_ROWS = np.dtype(
     [("fleet_ns", "i8"), *((name, _FORMATS[kind]) for name, kind in TickRecord.__annotations__.items())]
@@ -67,8 +69,8 @@ class Flight:
     truth: Array
     """TRUTH_DTYPE records; none where nobody knows"""
     takeoff_ns: int
-    centroid_limit_m: float = 0.5
-    """how far the centroid may be from the plan, in truth: an estimator with a GPS of its own is off by more"""
+    centroid_limit_m: float = CENTROID_M
+    """how far the centroid may be from the plan, in truth"""
     disarmed: Mapping[int, bool] = field(default_factory=dict)
     """vehicle -> whether its companion said so last; asked where there is no truth"""
     commands: dict[bytes, Command] = field(default_factory=dict)

@@ -10,16 +10,17 @@ import numpy as np
 from companion.about import PACKAGE
 from companion.config import FleetConfig
 from companion.core.events import MotionAdopted, PhaseChanged
-from companion.core.values import Phase
+from companion.core.values import FLYING_PHASES, Phase
 from companion.errors import ConfigError
 from companion.io.recording import Recording, read_recording
 from companion.io.replay import made_from
 from sim.autopilot.stubs import TRUTH_DTYPE
 from sim.launch.reference_loop import read_reference_loop
-from sim.launch.summary.flight import TICK_ROWS, TRAFFIC_ROWS, Array, Flight
+from sim.launch.summary.flight import CENTROID_GPS_M, CENTROID_M, TICK_ROWS, TRAFFIC_ROWS, Array, Flight
 
 ON_GROUND = (Phase.IDLE, Phase.LANDED)
-FOR_EVER_NS = 1 << 62
+LONGEST_NS = 24 * 3600 * 10**9
+"""beyond it the figures, ten a second, would not fit into a computer"""
 NOT_GIVEN = "no recording of it was given"
 
 
@@ -44,12 +45,15 @@ def recorded_flight(paths: Sequence[Path], number: int | None = None) -> tuple[F
     recordings are of different fleets, or hold no such flight; RecordingError for a file that is none.
     """
     by_vehicle: dict[int, list[tuple[int, Recording]]] = defaultdict(list)
+    seen: dict[tuple[int, int], Path] = {}
     configs: list[tuple[Path, FleetConfig]] = []
     software: set[str] = set()
     for path in recordings_of(paths):
         recording = read_recording(path)
-        config, vehicle_id, _ = made_from(recording)
+        config, vehicle_id, boot_id = made_from(recording)
         _same_fleet(configs, path, config)
+        if (same := seen.setdefault((vehicle_id, boot_id), path)) != path:
+            raise ConfigError(f"{path}: is of the same companion's life as {same}: give one of the two")
         first = next(iter(recording.entries), None)
         if first is not None:
             by_vehicle[vehicle_id].append((first.instant.fleet_ns, recording))
@@ -63,14 +67,19 @@ def recorded_flight(paths: Sequence[Path], number: int | None = None) -> tuple[F
         seed=0,
         truth=_truth(paths),
         takeoff_ns=0,
+        centroid_limit_m=CENTROID_GPS_M if any(list(path.glob("px4-*")) for path in paths) else CENTROID_M,
         versions={PACKAGE: ", ".join(sorted(software))},
     )
+    unclosed = set()
     for i, recorded in sorted(by_vehicle.items()):
-        flight.read_files(i, [r.path for _, r in sorted(recorded, key=lambda one: one[0])])
+        in_order = [r for _, r in sorted(recorded, key=lambda one: one[0])]
+        flight.read_files(i, [r.path for r in in_order])
+        if not in_order[-1].complete:
+            unclosed.add(i)
     for path in paths:
         if path.is_dir() and (file := path / "reference.bin").exists():
             flight.reference_lateness_ns = read_reference_loop(file)[:, 1].astype(float)
-    return _cut(flight, number), missing
+    return one_of(flight, number, unclosed), missing
 
 
 def _same_fleet(configs: list[tuple[Path, FleetConfig]], path: Path, config: FleetConfig) -> None:
@@ -102,8 +111,11 @@ def takeoffs_ns(flight: Flight) -> list[int]:
     return sorted(c.time_ns for c in flight.commands.values() if c.order.verb == "takeoff" and c.accepted)
 
 
-def _cut(flight: Flight, number: int | None) -> Flight:
-    """What belongs to one flight of all that was recorded."""
+def one_of(flight: Flight, number: int | None, unclosed: set[int]) -> Flight:
+    """What belongs to one flight of all that was recorded.
+
+    Of the `unclosed` recordings those that end in the air are of companions that were lost in flight.
+    """
     begins = takeoffs_ns(flight)
     if not begins:
         raise ConfigError("these recordings hold no take-off: nobody has flown")
@@ -111,7 +123,13 @@ def _cut(flight: Flight, number: int | None) -> Flight:
     if not 1 <= chosen <= len(begins):
         raise ConfigError(f"--flight must be 1 to {len(begins)}: so many take-offs are recorded, got {chosen}")
     begin = begins[chosen - 1]
-    end = begins[chosen] if chosen < len(begins) else FOR_EVER_NS
+    latest = max((int(rows["fleet_ns"].max()) for rows in flight.ticks.values() if len(rows)), default=begin)
+    end = begins[chosen] if chosen < len(begins) else latest + 1
+    if end - begin > LONGEST_NS:
+        raise ConfigError(
+            f"the flight would last {(end - begin) * 1e-9 / 3600:.0f} hours, may last {LONGEST_NS * 1e-9 / 3600:.0f}: "
+            "a clock was set in between, or a recording is damaged; leave that one out"
+        )
 
     def within(rows: Array) -> Array:
         return rows[(rows["fleet_ns"] >= begin) & (rows["fleet_ns"] < end)]
@@ -124,6 +142,7 @@ def _cut(flight: Flight, number: int | None) -> Flight:
     return replace(
         flight,
         takeoff_ns=begin,
+        lost=frozenset(i for i in unclosed if last.get(i) in FLYING_PHASES),
         truth=flight.truth[(flight.truth["time_unix_ns"] >= begin) & (flight.truth["time_unix_ns"] < end)],
         disarmed={i: phase in ON_GROUND for i, phase in last.items()},
         commands={k: c for k, c in flight.commands.items() if begin <= c.time_ns < end},

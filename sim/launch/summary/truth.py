@@ -48,7 +48,7 @@ def truth_of(records: Array, ids: Sequence[int]) -> Truth:
         none = np.zeros((0, len(ids)))
         never = none.astype(bool)
         return Truth(
-            none[:, 0], np.zeros((0, len(ids), 3)), np.zeros((0, len(ids), 3)), none, *(never,) * 3, {}, None, None
+            np.zeros(0), np.zeros((0, len(ids), 3)), np.zeros((0, len(ids), 3)), none, *(never,) * 3, {}, None, None
         )
     times = max(rows.values(), key=lambda mine: mine["time_unix_ns"][-1] - mine["time_unix_ns"][0])["time_unix_ns"]
     for mine in rows.values():
